@@ -1,0 +1,134 @@
+"""The camera: pinhole with Brown-Conrady distortion, and the files its calibration comes in.
+
+Camera frame: x right, y down, z forward.  Pixels: (0, 0) is the centre of the top-left pixel.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+DISTORTION_TERMS = 5
+PRINCIPAL_POINT_SLACK = 0.15
+"""How far from the middle, as a fraction of the image, a principal point may lie and still be believed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A calibrated camera: K (3, 3) in pixels, distortion (k1, k2, p1, p2, k3), image width and height in pixels."""
+
+    K: Array
+    distortion: Array = field(default_factory=lambda: np.zeros(DISTORTION_TERMS))
+    width: int = 0
+    height: int = 0
+
+    def __init__(self, K: ArrayLike, distortion: ArrayLike = (0.0,) * DISTORTION_TERMS, *, width: int, height: int):
+        K, distortion = np.array(K, dtype=float), np.array(distortion, dtype=float).ravel()
+        if K.shape != (3, 3) or not np.allclose(K[2], (0, 0, 1)):
+            raise ValueError(f"K must be 3x3 with last row 0 0 1, got shape {K.shape}. Is it transposed?")
+        if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
+            raise ValueError(f"K must be finite with positive focal lengths, got fx {K[0, 0]}, fy {K[1, 1]}")
+        if distortion.size not in (0, 4, DISTORTION_TERMS) or not np.isfinite(distortion).all():
+            raise ValueError(
+                f"distortion must be 5 finite terms (k1, k2, p1, p2, k3), got {distortion.size}: "
+                "fisheye and rational models are not supported"
+            )
+        if int(width) <= 0 or int(height) <= 0:
+            raise ValueError(f"width and height must be positive pixels, got {width}x{height}")
+        padded = np.zeros(DISTORTION_TERMS)
+        padded[: distortion.size] = distortion
+        for name, value in (("K", K), ("distortion", padded), ("width", int(width)), ("height", int(height))):
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def load(
+        cls, path: str | Path, *, width: int | None = None, height: int | None = None, scale: bool = False
+    ) -> Camera:
+        """Read the reference's JSON (``camera_matrix``, ``distortion_coefficients``) or ROS camera_info YAML.
+
+        Given the images' width and height, the camera returned is for that size: a calibration of another
+        size is refused, or scaled when ``scale`` says that the picture was only resized.  The reference's
+        JSON does not tell its size; the principal point must then lie near the middle of the images.
+        Raises ValueError with what is missing or wrong.
+        """
+        path = Path(path)
+        try:
+            text = path.read_text()
+            data: Any = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
+        except (OSError, UnicodeDecodeError, json.JSONDecodeError, yaml.YAMLError) as error:
+            raise ValueError(f"cannot read camera file {path}: {' '.join(str(error).split())}") from error
+        try:
+            K = _numbers(data["camera_matrix"]).reshape(3, 3)
+            distortion = _numbers(data.get("distortion_coefficients", ()))
+            model = data.get("distortion_model", "plumb_bob")
+            size = (int(data.get("image_width", 0)), int(data.get("image_height", 0)))
+        except (KeyError, TypeError, AttributeError, ValueError) as error:
+            raise ValueError(f"camera file {path} has no readable camera_matrix and distortion_coefficients") from error
+        if model not in ("plumb_bob", ""):
+            raise ValueError(f"camera file {path}: distortion model {model!r} is not supported, only plumb_bob")
+        if not all(size):
+            size = _size_from_principal_point(K, width, height)
+        camera = cls(K, distortion, width=size[0], height=size[1])
+        if width is None or height is None:
+            return camera
+        if scale:
+            return camera.scaled(width, height)
+        camera.require_size(width, height)
+        return camera
+
+    def scaled(self, width: int, height: int) -> Camera:
+        """Return this camera for the same picture resized to width x height pixels."""
+        sx, sy = width / self.width, height / self.height
+        K = self.K.copy()
+        K[0] *= sx
+        K[1] *= sy
+        K[0, 2], K[1, 2] = (self.K[0, 2] + 0.5) * sx - 0.5, (self.K[1, 2] + 0.5) * sy - 0.5
+        return Camera(K, self.distortion, width=width, height=height)
+
+    def require_size(self, width: int, height: int) -> None:
+        """Raise ValueError when images of width x height pixels are not what this calibration is for."""
+        if (width, height) != (self.width, self.height):
+            raise ValueError(
+                f"the calibration is for {self.width}x{self.height}, the images are {width}x{height}: "
+                "calibrate at that size, or scale the calibration if the picture was only resized"
+            )
+
+    def project(self, points_cam: Array) -> Array:
+        """Return pixels (N, 2) of points (N, 3) in the camera frame, which must lie in front of it (z > 0)."""
+        points = np.ascontiguousarray(points_cam, dtype=float).reshape(-1, 1, 3)
+        zero = np.zeros(3)
+        return cv2.projectPoints(points, zero, zero, self.K, self.distortion)[0].reshape(-1, 2)
+
+    def undistort(self, points_px: Array) -> Array:
+        """Return where pixels (N, 2) would be without distortion, in normalised coordinates x/z, y/z (N, 2)."""
+        points = np.ascontiguousarray(points_px, dtype=float).reshape(-1, 1, 2)
+        if not self.distortion.any():
+            return (points.reshape(-1, 2) - self.K[:2, 2]) @ np.linalg.inv(self.K[:2, :2]).T
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-12)
+        return cv2.undistortPoints(points, self.K, self.distortion, criteria=criteria).reshape(-1, 2)
+
+
+def _size_from_principal_point(K: Array, width: int | None, height: int | None) -> tuple[int, int]:
+    """Return the image size of a calibration that does not tell it: the images' own if K fits them, else 2 c."""
+    guess = (round(2 * K[0, 2]), round(2 * K[1, 2]))
+    if width is None or height is None:
+        return guess
+    near = (
+        abs(guess[0] / width - 1) < 2 * PRINCIPAL_POINT_SLACK and abs(guess[1] / height - 1) < 2 * PRINCIPAL_POINT_SLACK
+    )
+    return (width, height) if near else guess
+
+
+def _numbers(value: Any) -> Array:
+    """Return the numbers of a nested list or of ROS's {rows, cols, data}, flat."""
+    if isinstance(value, dict):
+        value = value["data"]
+    return np.array(value, dtype=float).ravel()

@@ -1,0 +1,73 @@
+"""Rigid transforms as 4x4 matrices, and the one perturbation convention used for every pose covariance.
+
+``T_a_b`` takes b-coordinates to a and is the pose of b in a.  A pose is perturbed on the right, in the
+child's axes, metres then radians: T = T_hat * [Exp(theta), rho], xi = (rho, theta).
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+
+def pose(R_a_b: ArrayLike, t_a_b_m: ArrayLike) -> Array:
+    """Return T_a_b (4, 4) from a rotation (3, 3) and a translation (3,)."""
+    T = np.eye(4)
+    T[:3, :3] = R_a_b
+    T[:3, 3] = np.asarray(t_a_b_m, dtype=float).reshape(3)
+    return T
+
+
+def inverse(T_a_b: Array) -> Array:
+    """Return T_b_a."""
+    R = T_a_b[:3, :3]
+    return pose(R.T, -R.T @ T_a_b[:3, 3])
+
+
+def transform(T_a_b: Array, points_b: Array) -> Array:
+    """Return points (..., 3) of b in a."""
+    return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def exp_so3(theta_rad: ArrayLike) -> Array:
+    """Return the rotation (3, 3) of a rotation vector (3,)."""
+    return cv2.Rodrigues(np.asarray(theta_rad, dtype=float).reshape(3, 1))[0]
+
+
+def log_so3(R_a_b: Array) -> Array:
+    """Return the rotation vector (3,) of a rotation, its angle in [0, pi]."""
+    return Rotation.from_matrix(R_a_b).as_rotvec()
+
+
+def skew(v: ArrayLike) -> Array:
+    """Return the matrix (3, 3) of the cross product: skew(v) @ w == cross(v, w)."""
+    x, y, z = np.asarray(v, dtype=float).reshape(3)
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def perturb(T_a_b: Array, xi: ArrayLike) -> Array:
+    """Return T_a_b moved by xi = (rho m, theta rad) (6,) in the axes of b."""
+    xi = np.asarray(xi, dtype=float)
+    R = T_a_b[:3, :3]
+    return pose(R @ exp_so3(xi[3:]), T_a_b[:3, 3] + R @ xi[:3])
+
+
+def difference(T_a_b: Array, T_a_b_hat: Array) -> Array:
+    """Return xi (6,) with perturb(T_a_b_hat, xi) == T_a_b: the error whose covariance a pose carries."""
+    R_hat = T_a_b_hat[:3, :3]
+    rho = R_hat.T @ (T_a_b[:3, 3] - T_a_b_hat[:3, 3])
+    return np.concatenate([rho, log_so3(R_hat.T @ T_a_b[:3, :3])])
+
+
+def wxyz_from_rotation(R_a_b: Array) -> Array:
+    """Return the unit quaternion (w, x, y, z), w >= 0."""
+    return Rotation.from_matrix(R_a_b).as_quat(canonical=True, scalar_first=True)
+
+
+def rotation_from_wxyz(rotation_wxyz: ArrayLike) -> Array:
+    """Return the rotation (3, 3) of a quaternion (w, x, y, z)."""
+    return Rotation.from_quat(np.asarray(rotation_wxyz, dtype=float), scalar_first=True).as_matrix()
