@@ -1,0 +1,1 @@
+"""The AstraTag marker: geometry, codes, artwork, camera model, detection and pose.  Knows no transport."""

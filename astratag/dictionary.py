@@ -15,31 +15,10 @@ from astratag.geometry import CELLS, turn_clockwise
 ORIENTATIONS = ("0", "90", "180", "270")
 """Names of the four readings: "90" is what the print reads when turned clockwise by 90 degrees."""
 
-PUBLISHED_MESSAGES = tuple(
-    int(m, 16)
-    for m in [
-        "3ad948",
-        "6a7c47",
-        "928b3a",
-        "5ed181",
-        "21a31b",
-        "bdec98",
-        "671123",
-        "89bccd",
-        "91c6b9",
-        "58238b",
-        "a41fe9",
-        "2afb01",
-        "89b9d0",
-        "be5abc",
-        "84ca19",
-        "f2db2d",
-        "77bb25",
-        "f6e292",
-        "daf4e8",
-        "96d66e",
-    ]
-)
+PUBLISHED_MESSAGES = (
+    (0x3AD948, 0x6A7C47, 0x928B3A, 0x5ED181, 0x21A31B, 0xBDEC98, 0x671123, 0x89BCCD, 0x91C6B9, 0x58238B)
+    + (0xA41FE9, 0x2AFB01, 0x89B9D0, 0xBE5ABC, 0x84CA19, 0xF2DB2D, 0x77BB25, 0xF6E292, 0xDAF4E8, 0x96D66E)
+)  # fmt: skip
 """The 24-bit messages behind the twenty markers published with the AstraTag paper (2026)."""
 
 

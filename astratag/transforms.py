@@ -44,7 +44,7 @@ def log_so3(R_a_b: Array) -> Array:
 
 
 def skew(v: ArrayLike) -> Array:
-    """Return the matrix (3, 3) of the cross product: skew(v) @ w == cross(v, w)."""
+    """Return the matrix (3, 3) that takes w to the cross product of v and w."""
     x, y, z = np.asarray(v, dtype=float).reshape(3)
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
