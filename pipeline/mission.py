@@ -1,0 +1,163 @@
+"""The mission: vehicle, camera mounting, the target's marker map, ports, corridor and filter, in one file.
+
+Written as YAML or JSON by people, carried as the attachment ``mission.json`` in every recording, and read by
+every node.  Frames and units as in ``schemas``; every field has a default that works.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from astratag.surface import Cylinder, Flat
+from astratag.transforms import pose, rotation_from_wxyz
+
+ATTACHMENT = "mission.json"
+"""The name under which a recording carries its mission."""
+
+
+class Section(BaseModel):
+    """Base of all sections: closed, immutable, finite."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class PoseSection(Section):
+    """A rigid transform; the field that holds it names both frames."""
+
+    translation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _unit(self) -> PoseSection:
+        norm = float(np.linalg.norm(self.rotation_wxyz))
+        if abs(norm - 1) > 1e-3:
+            raise ValueError(f"rotation_wxyz must be a unit quaternion, its norm is {norm:.4g}")
+        return self
+
+    def matrix(self) -> NDArray[np.float64]:
+        """Return the 4x4 transform."""
+        return pose(rotation_from_wxyz(self.rotation_wxyz), self.translation_m)
+
+
+class FlatSection(Section):
+    """A flat surface."""
+
+    kind: Literal["flat"] = "flat"
+
+    def surface(self) -> Flat:
+        """Return the marker library's surface."""
+        return Flat()
+
+
+class CylinderSection(Section):
+    """The outside of a cylinder; ``axis_rad`` is its axis in the marker's plane, from x towards y."""
+
+    kind: Literal["cylinder"] = "cylinder"
+    radius_m: float = Field(gt=0)
+    axis_rad: float = 0.0
+
+    def surface(self) -> Cylinder:
+        """Return the marker library's surface."""
+        return Cylinder(self.radius_m, self.axis_rad)
+
+
+class MarkerSection(Section):
+    """One marker on the target."""
+
+    id: int = Field(ge=0)
+    side_m: float = Field(default=0.1, gt=0)
+    surface: Annotated[FlatSection | CylinderSection, Field(discriminator="kind")] = FlatSection()
+    T_target_marker: PoseSection = PoseSection()
+
+
+class CameraSection(Section):
+    """The camera and where it sits on the chaser."""
+
+    name: str = Field(default="nav", pattern=r"^[A-Za-z0-9_-]+$")
+    T_chaser_cam: PoseSection = PoseSection()
+    transfer: Literal["srgb", "linear"] = "srgb"
+    """How pixel values follow light: edges are located in linear light."""
+
+
+class CorridorSection(Section):
+    """The approach corridor: a cone about the target port's outward axis, with its apex behind the port."""
+
+    half_angle_rad: float = Field(default=float(np.deg2rad(10.0)), gt=0, lt=np.pi / 2)
+    start_m: float = Field(default=1.5, gt=0)
+    port_radius_m: float = Field(default=0.02, ge=0)
+    """Radius of the corridor at the port itself."""
+
+
+class FilterSection(Section):
+    """The pose filter's noise, gates and timers."""
+
+    acceleration_m_s2: float = Field(default=0.02, gt=0)
+    """Standard deviation of the relative acceleration, white over ``correlation_s``."""
+    angular_acceleration_rad_s2: float = Field(default=0.05, gt=0)
+    correlation_s: float = Field(default=0.2, gt=0)
+    initial_speed_m_s: float = Field(default=0.2, gt=0)
+    initial_rate_rad_s: float = Field(default=0.2, gt=0)
+    gate_probability: float = Field(default=0.999, gt=0.5, lt=1)
+    """Share of true measurements that a gate lets through."""
+    coast_s: float = Field(default=5.0, gt=0)
+    """Longest propagation without measurements before LOST."""
+
+
+class Mission(Section):
+    """Everything the nodes must agree on."""
+
+    vehicle: str = Field(default="chaser", pattern=r"^[A-Za-z0-9_-]+$")
+    camera: CameraSection = CameraSection()
+    dictionary: str = "astratag20"
+    default_side_m: float = Field(default=0.1, gt=0)
+    """Side of a marker when the map is empty."""
+    markers: tuple[MarkerSection, ...] = ()
+    """Empty: the first marker seen, flat and of the default side, is the target frame."""
+    T_chaser_port: PoseSection = PoseSection()
+    T_target_port: PoseSection = PoseSection()
+    corridor: CorridorSection = CorridorSection()
+    filter: FilterSection = FilterSection()
+
+    @model_validator(mode="after")
+    def _distinct(self) -> Mission:
+        ids = [marker.id for marker in self.markers]
+        if len(set(ids)) != len(ids):
+            raise ValueError(f"markers lists an id twice: {ids}")
+        return self
+
+    @classmethod
+    def parse(cls, text: str | bytes, *, source: str) -> Mission:
+        """Read a mission from YAML or JSON text.  Raises ValueError that names the source and the field."""
+        try:
+            data: Any = yaml.safe_load(text)
+            return cls.model_validate(data if data is not None else {})
+        except yaml.YAMLError as error:
+            raise ValueError(f"mission {source} is not YAML or JSON: {' '.join(str(error).split())}") from error
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"]) or "the file"
+            raise ValueError(f"mission {source}: {where}: {first['msg']}") from error
+
+    @classmethod
+    def load(cls, path: str | Path) -> Mission:
+        """Read a mission file.  Raises ValueError when it cannot be read or is not valid."""
+        try:
+            text = Path(path).read_text()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ValueError(f"cannot read mission {path}: {error}") from error
+        return cls.parse(text, source=str(path))
+
+    def to_json(self) -> str:
+        """Return the mission as indented JSON, which ``parse`` reads back unchanged."""
+        return json.dumps(self.model_dump(mode="json"), indent=2) + "\n"
+
+    def marker(self, marker_id: int) -> MarkerSection | None:
+        """Return a marker of the map, or None when it is not on the target."""
+        return next((marker for marker in self.markers if marker.id == marker_id), None)
