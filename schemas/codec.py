@@ -24,7 +24,7 @@ AnyMessage = Message | ProtoMessage
 M = TypeVar("M", bound=AnyMessage)
 
 _FIELD = descriptor_pb2.FieldDescriptorProto
-SCALARS: dict[type, tuple[int, str]] = {
+SCALARS: dict[type, tuple[Any, str]] = {
     float: (_FIELD.TYPE_DOUBLE, "double"),
     int: (_FIELD.TYPE_INT64, "int64"),
     bool: (_FIELD.TYPE_BOOL, "bool"),
@@ -107,14 +107,14 @@ def proto_class(model: type[Message]) -> Callable[[], ProtoMessage]:
     return message_factory.GetMessageClass(file_descriptor().message_types_by_name[model.__name__])
 
 
-def descriptor_of(schema: type[Message] | type[ProtoMessage]) -> Descriptor:
+def descriptor_of(schema: type) -> Descriptor:
     """Return the protobuf descriptor of a message class, ours or foxglove's."""
     if issubclass(schema, Message):
-        return typing.cast(Descriptor, file_descriptor().message_types_by_name[schema.__name__])
+        return file_descriptor().message_types_by_name[schema.__name__]
     return typing.cast(Descriptor, schema.DESCRIPTOR)
 
 
-def schema_name(schema: type[Message] | type[ProtoMessage]) -> str:
+def schema_name(schema: type) -> str:
     """Return a schema's full name, such as "relnav.RelativeState" or "foxglove.Log"."""
     return descriptor_of(schema).full_name
 

@@ -1,0 +1,53 @@
+"""The pipeline's steps, one table: what each consumes, what it produces, and how it is built.
+
+A step knows no clock, socket or file: the same object runs behind the bus, in direct replay and in tests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+from pipeline.detector import DetectorStep
+from pipeline.mission import Mission
+from pipeline.pose_filter import PoseFilter
+from schemas import Envelope, Topic
+from schemas.codec import AnyMessage
+from schemas.topics import ANNOTATIONS, CALIBRATION, DETECTIONS, EVENTS, FRAME, STATE, TRANSFORMS
+
+
+class Step(Protocol):
+    """A node's work on one message."""
+
+    def step(self, message: AnyMessage) -> Iterable[AnyMessage]:
+        """Take one message and return what follows from it, in order."""
+        ...
+
+
+class Sink(Protocol):
+    """Something that keeps or shows what passes: the recorder, the viewer."""
+
+    def write(self, envelope: Envelope, t_receipt_ns: int) -> None:
+        """Take one envelope, received at UTC ``t_receipt_ns``."""
+        ...
+
+    def close(self) -> None:
+        """Finish: nothing taken so far may be lost."""
+        ...
+
+
+@dataclass(frozen=True)
+class StepSpec:
+    """One row of the table."""
+
+    name: str
+    consumes: tuple[Topic, ...]
+    produces: tuple[Topic, ...]
+    build: Callable[[Mission], Step]
+
+
+STEPS = (
+    StepSpec("detector", (CALIBRATION, FRAME), (DETECTIONS, ANNOTATIONS), DetectorStep),
+    StepSpec("pose_filter", (CALIBRATION, DETECTIONS), (STATE, TRANSFORMS, EVENTS), PoseFilter),
+)
