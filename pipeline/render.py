@@ -1,0 +1,267 @@
+"""The simulated camera: rays cast through a calibrated lens at printed markers and simple bodies, in linear light.
+
+Everything is anti-aliased by area before it is encoded, so an edge in the linear picture stands where
+``Camera.project`` puts it (checked to 0.02 px).  Pixels: (0, 0) is the centre of the top-left pixel.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from astratag.camera import Camera
+from astratag.geometry import (
+    DRAWN_OFFSET,
+    LAYERS,
+    QUIET_MARGIN,
+    TEMPLATE_UNITS,
+    Layer,
+    cell_polygons,
+    layer_points,
+)
+from astratag.surface import Cylinder, Flat, Surface
+from astratag.transforms import inverse
+
+Array = NDArray[np.float64]
+Image = NDArray[np.float32]
+Encoding = Literal["srgb", "linear"]
+
+BLACK_ALBEDO = 0.04
+WHITE_ALBEDO = 0.85
+PRINT_UNITS = TEMPLATE_UNITS * (1 + 2 * QUIET_MARGIN)
+TEXELS_PER_UNIT = 4
+"""Texels of the print to a template unit: at most a pixel each while a unit spans less than 4 px."""
+
+
+class Texture:
+    """A picture in linear light on a surface, with halved copies of itself so that it can be read area by area.
+
+    ``picture`` (rows, columns) or (rows, columns, 3), 0 to 1, covers ``width_m`` by its share in height, centred on
+    (0, 0) of the surface, first row at the top (largest y).
+    """
+
+    def __init__(self, picture: NDArray[np.float32] | NDArray[np.uint8], width_m: float):
+        self._texels_per_m = picture.shape[1] / width_m
+        self._levels = [picture]
+        while min(self._levels[-1].shape[:2]) >= 8:
+            rows, columns = self._levels[-1].shape[:2]
+            self._levels.append(cv2.resize(self._levels[-1], (columns // 2, rows // 2), interpolation=cv2.INTER_AREA))
+
+    def read(self, x_m: Array, y_m: Array, footprint_m: float) -> Image:
+        """Return the picture at surface points (2-D arrays), averaged over squares of side ``footprint_m``.
+
+        Averages are symmetric, so edges keep their place.  Outside the picture its border goes on.
+        """
+        level = int(np.clip(np.round(np.log2(max(footprint_m * self._texels_per_m, 1.0))), 0, len(self._levels) - 1))
+        picture = self._levels[level]
+        rows, columns = picture.shape[:2]
+        scale = self._texels_per_m * columns / self._levels[0].shape[1]
+        at_x = (x_m * scale + (columns - 1) / 2).astype(np.float32)
+        at_y = ((rows - 1) / 2 - y_m * scale).astype(np.float32)
+        read = cv2.remap(picture, at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return read / np.float32(255) if picture.dtype == np.uint8 else read
+
+
+def print_coverage(signature: NDArray[np.uint8], texels_per_unit: int = TEXELS_PER_UNIT) -> NDArray[np.uint8]:
+    """Return how much of each texel of a print with its quiet margin is white, 0 to 255, upright.
+
+    The print carries the 48 bits of ``signature`` in all three layers.  Texels are squares of 1 / ``texels_per_unit``
+    template units; straight edges are exact to 1/255 of a texel.
+    """
+    margin = TEMPLATE_UNITS * QUIET_MARGIN
+    size = round(PRINT_UNITS * texels_per_unit)
+    centres = (np.arange(size) + 0.5) / texels_per_unit - margin
+    white = np.ones((size, size), np.float32)
+    for layer in LAYERS:
+        _paint_square(white, centres, layer, texels_per_unit)
+        cells = layer_points(cell_polygons() + DRAWN_OFFSET, layer)
+        for corners, bit in zip(cells, signature, strict=True):
+            if bit:
+                _add_triangle(white, centres, corners, texels_per_unit)
+    return np.round(white * 255).astype(np.uint8)
+
+
+def _paint_square(white: Image, centres: Array, layer: Layer, texels_per_unit: int) -> None:
+    """Lay a layer's white frame, its outer corners rounded, and the black square inside it."""
+    if layer.frame is not None:
+        near, far = layer.frame
+        radius = layer.frame_corner_radius
+        beyond = np.abs(centres - (near + far) / 2) - ((far - near) / 2 - radius)
+        outside = np.hypot(np.maximum(beyond[:, None], 0), np.maximum(beyond[None, :], 0))
+        inside = radius - outside - np.minimum(np.maximum(beyond[:, None], beyond[None, :]), 0)
+        np.maximum(white, np.clip(inside * texels_per_unit + 0.5, 0, 1), out=white)
+    near, far = layer.black
+    along = np.clip((np.minimum(centres - near, far - centres)) * texels_per_unit + 0.5, 0, 1)
+    white *= 1 - (along[:, None] * along[None, :]).astype(np.float32)
+
+
+def _add_triangle(white: Image, centres: Array, corners: Array, texels_per_unit: int) -> None:
+    """Add a white triangle (3, 2): neighbours share an edge, so what they cover adds up to one."""
+    low, high = np.searchsorted(centres, corners.min(axis=0) - 1), np.searchsorted(centres, corners.max(axis=0) + 1)
+    x, y = centres[low[0] : high[0]], centres[low[1] : high[1]]
+    edges = np.roll(corners, -1, axis=0) - corners
+    turn = np.sign(edges[0, 0] * edges[1, 1] - edges[0, 1] * edges[1, 0])
+    covered = np.ones((len(y), len(x)), np.float32)
+    for (ax, ay), (ex, ey) in zip(corners, edges, strict=True):
+        normal = turn * np.array([-ey, ex]) / np.hypot(ex, ey)
+        inside = ((x - ax) * normal[0])[None, :] + ((y - ay) * normal[1])[:, None]
+        widest = np.abs(normal).sum()
+        covered *= np.clip(inside * texels_per_unit / widest + 0.5, 0, 1).astype(np.float32)
+    patch = white[low[1] : high[1], low[0] : high[0]]
+    np.minimum(patch + covered, 1.0, out=patch)
+
+
+@lru_cache(maxsize=8)
+def _print_texture(signature: bytes, side_m: float) -> Texture:
+    coverage = print_coverage(np.frombuffer(signature, np.uint8))
+    return Texture(coverage, side_m * PRINT_UNITS / TEMPLATE_UNITS)
+
+
+@lru_cache(maxsize=4)
+def pixel_rays(camera: Camera) -> tuple[Array, Array, Array]:
+    """Return x/z and y/z of the ray through each pixel's centre (H, W, 2), and their change a pixel right and down."""
+    columns, rows = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
+    rays = camera.undistort(np.stack([columns, rows], axis=-1).reshape(-1, 2)).reshape(camera.height, camera.width, 2)
+    right, down = (np.asarray(np.gradient(rays, axis=axis)) for axis in (1, 0))
+    return rays, right, down
+
+
+def srgb_from_linear(light: Image) -> Image:
+    """Return the sRGB code value (0 to 1) of linear light, which is cut off at 0 and 1."""
+    light = np.clip(light, 0.0, 1.0)
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.power(light, 1 / 2.4) - 0.055).astype(np.float32)
+
+
+def linear_from_srgb(code: Image) -> Image:
+    """Return the linear light (0 to 1) of sRGB code values (0 to 1)."""
+    return np.where(code <= 0.04045, code / 12.92, np.power((code + 0.055) / 1.055, 2.4)).astype(np.float32)
+
+
+def render_marker(
+    camera: Camera,
+    T_cam_marker: Array,
+    *,
+    signature: NDArray[np.uint8],
+    side_m: float,
+    surface: Surface | None = None,
+    blur_px: float = 0.8,
+    noise_sigma: float = 2.0,
+    background: float | NDArray[np.uint8] = 40.0,
+    seed: int = 0,
+    encoding: Encoding = "srgb",
+    samples: int = 3,
+) -> NDArray[np.uint8]:
+    """Return a gray picture (height, width) of one evenly lit marker print, for tests and benchmarks.
+
+    The print shows the 48 bits of ``signature`` in all its layers, black 0.04 and white 0.85 of full light, with its
+    quiet margin, on ``surface`` (Flat by default).  ``blur_px`` is the sigma of the point spread, ``noise_sigma`` that
+    of Gaussian noise in grey levels, ``background`` a grey level or picture (height, width) behind the print,
+    ``samples`` the rays a pixel each way.  The same arguments give the same picture.
+
+    Raises ValueError when a size or a shape is impossible.
+    """
+    if signature.shape != (48,):
+        raise ValueError(f"signature must be the 48 bits of one marker, got shape {signature.shape}")
+    if not side_m > 0:
+        raise ValueError(f"side_m must be a positive side in metres, got {side_m}")
+    levels = np.broadcast_to(np.asarray(background, dtype=np.float32), (camera.height, camera.width)) / np.float32(255)
+    light = (linear_from_srgb(levels) if encoding == "srgb" else levels).astype(np.float32)
+    _lay_print(light, camera, T_cam_marker, signature, side_m, surface or Flat(), samples)
+    if blur_px > 0:
+        light = cv2.GaussianBlur(light, (0, 0), blur_px, borderType=cv2.BORDER_REPLICATE)
+    code = (srgb_from_linear(light) if encoding == "srgb" else np.clip(light, 0, 1)) * np.float32(255)
+    if noise_sigma > 0:
+        code += np.float32(noise_sigma) * np.random.default_rng(seed).standard_normal(code.shape, dtype=np.float32)
+    return np.clip(np.round(code), 0, 255).astype(np.uint8)
+
+
+def _lay_print(
+    light: Image,
+    camera: Camera,
+    T_cam_marker: Array,
+    signature: NDArray[np.uint8],
+    side_m: float,
+    surface: Surface,
+    samples: int,
+) -> None:
+    """Lay an evenly lit print over the picture ``light``, inside the rectangle of pixels that it can touch."""
+    half_m = side_m * PRINT_UNITS / TEMPLATE_UNITS / 2
+    window = _window(camera, T_cam_marker, surface, half_m)
+    if window is None:
+        return
+    texture = _print_texture(np.ascontiguousarray(signature, np.uint8).tobytes(), side_m)
+    rays, right, down = (part[window] for part in pixel_rays(camera))
+    behind = light[window].copy()
+    total = np.zeros_like(behind)
+    T_marker_cam = inverse(T_cam_marker)
+    for dy in (np.arange(samples) + 0.5) / samples - 0.5:
+        for dx in (np.arange(samples) + 0.5) / samples - 0.5:
+            ray = rays + dx * right + dy * down
+            x, y, stretch, seen = _hit_print(surface, T_marker_cam, ray)
+            if not seen.any():
+                total += behind
+                continue
+            footprint = float(np.median(stretch[seen])) / np.sqrt(camera.K[0, 0] * camera.K[1, 1]) / samples
+            alpha = np.clip((half_m - np.abs(x)) / footprint + 0.5, 0, 1)
+            alpha *= np.clip((half_m - np.abs(y)) / footprint + 0.5, 0, 1) * seen
+            albedo = BLACK_ALBEDO + (WHITE_ALBEDO - BLACK_ALBEDO) * texture.read(x, y, footprint)
+            total += (behind + alpha * (albedo - behind)).astype(np.float32)
+    light[window] = total / np.float32(samples**2)
+
+
+def _hit_print(surface: Surface, T_marker_cam: Array, rays: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Return where rays (H, W, 2) meet a surface on its outside.
+
+    Gives print coordinates x and y, the square root of the surface area a unit of solid ray area covers, and whether
+    the ray meets the surface at all.
+    """
+    R, o = T_marker_cam[:3, :3], T_marker_cam[:3, 3]
+    dx, dy, dz = (R[k, 0] * rays[..., 0] + R[k, 1] * rays[..., 1] + R[k, 2] for k in range(3))
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        if isinstance(surface, Flat):
+            depth = -o[2] / dz
+            x, y, facing = o[0] + depth * dx, o[1] + depth * dy, -dz
+        else:
+            depth, x, y, facing = _hit_cylinder(surface, o, dx, dy, dz)
+        seen = (depth > 0) & (facing > 0) & np.isfinite(depth)
+        stretch = np.where(seen, depth / np.sqrt(facing), 0.0)
+    return np.where(seen, x, 0.0), np.where(seen, y, 0.0), stretch, seen
+
+
+def _hit_cylinder(surface: Cylinder, o: Array, dx: Array, dy: Array, dz: Array) -> tuple[Array, Array, Array, Array]:
+    """Return depth, print coordinates and the ray's fall against the normal; NaN where a ray passes by."""
+    radius = surface.radius_m
+    c, s = np.cos(surface.axis_rad), np.sin(surface.axis_rad)
+    along_o, across_o, up_o = c * o[0] + s * o[1], c * o[1] - s * o[0], o[2] + radius
+    along_d, across_d = c * dx + s * dy, c * dy - s * dx
+    a = across_d**2 + dz**2
+    b = across_o * across_d + up_o * dz
+    depth = (-b - np.sqrt(b**2 - a * (across_o**2 + up_o**2 - radius**2))) / a
+    across, up = across_o + depth * across_d, up_o + depth * dz
+    along, around = along_o + depth * along_d, radius * np.arctan2(across, up)
+    facing = -(across * across_d + up * dz) / radius
+    return depth, c * along - s * around, s * along + c * around, facing
+
+
+def _window(camera: Camera, T_cam_marker: Array, surface: Surface, half_m: float) -> tuple[slice, slice] | None:
+    """Return the rows and columns of pixels that a print can touch, None when it is out of sight."""
+    grid = np.linspace(-half_m, half_m, 33)
+    points = surface.points(np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2))
+    points_cam = points @ T_cam_marker[:3, :3].T + T_cam_marker[:3, 3]
+    in_front = points_cam[:, 2] > 1e-3 * half_m
+    if not in_front.any():
+        return None
+    if not in_front.all():
+        return slice(0, camera.height), slice(0, camera.width)
+    pixels = camera.project(points_cam)
+    low = np.floor(pixels.min(axis=0)).astype(int) - 3
+    high = np.ceil(pixels.max(axis=0)).astype(int) + 4
+    columns = slice(max(low[0], 0), min(high[0], camera.width))
+    rows = slice(max(low[1], 0), min(high[1], camera.height))
+    if columns.start >= columns.stop or rows.start >= rows.stop:
+        return None
+    return rows, columns
