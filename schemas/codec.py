@@ -107,14 +107,14 @@ def proto_class(model: type[Message]) -> Callable[[], ProtoMessage]:
     return message_factory.GetMessageClass(file_descriptor().message_types_by_name[model.__name__])
 
 
-def descriptor_of(schema: type) -> Descriptor:
+def descriptor_of(schema: Any) -> Descriptor:
     """Return the protobuf descriptor of a message class, ours or foxglove's."""
     if issubclass(schema, Message):
         return file_descriptor().message_types_by_name[schema.__name__]
     return typing.cast(Descriptor, schema.DESCRIPTOR)
 
 
-def schema_name(schema: type) -> str:
+def schema_name(schema: Any) -> str:
     """Return a schema's full name, such as "relnav.RelativeState" or "foxglove.Log"."""
     return descriptor_of(schema).full_name
 
