@@ -44,7 +44,7 @@ MAX_PIXELS = 150_000_000
 FONT_MM = 2.5
 CROP_MM = 4.0
 """Length of the crop marks, and the clear border outside the quiet margin that holds them."""
-LABEL_MM = 11.0
+LABEL_MM = 12.0
 """Height of the strip below the quiet margin that holds the scale bar and the label."""
 ARC_STEPS = 16
 """Chords in a rounded corner: they leave the arc by 0.012 template units, 2 micrometres on a 100 mm marker."""
@@ -139,7 +139,7 @@ class _Sheet:
 
 def _sheet(dictionary: Dictionary, marker_id: int, side_mm: float) -> _Sheet:
     signature = dictionary.signature(marker_id)
-    label = f"{dictionary.family}  id {marker_id}  side {side_mm:.6g} mm"
+    label = f"{dictionary.family}, id {marker_id}, side {side_mm:.6g} mm"
     unit = side_mm / TEMPLATE_UNITS
     margin = round(QUIET_MARGIN * TEMPLATE_UNITS)
     border, strip = int(np.ceil(CROP_MM / unit)), int(np.ceil(LABEL_MM / unit))
@@ -150,7 +150,7 @@ def _sheet(dictionary: Dictionary, marker_id: int, side_mm: float) -> _Sheet:
     ink += _crop_marks(left * unit, top * unit, cut * unit)
 
     bar = _scale_bar_mm(cut * unit)
-    x, y = border * unit, (top + cut) * unit + CROP_MM
+    x, y = border * unit, (top + cut) * unit + CROP_MM + 1.0
     ink.append(_rectangle(x, y, bar, 1.0))
     texts = [((x + bar + 1.0, y + 1.4), f"{bar:g} mm"), ((x, y + 1.0 + 1.6 * FONT_MM), label)]
     return _Sheet(unit, (cut + 2 * left, cut + border + strip), ink, label, texts)
@@ -245,10 +245,9 @@ def _figure(sheet: _Sheet, dpi: float) -> Figure:
     to_dots = Affine2D().scale(dots, -dots).translate(0.0, height * dots)
     ink = Outline.make_compound_path(*(Outline([*outline, outline[0]], closed=True) for outline in sheet.ink))
     figure.add_artist(PathPatch(ink, facecolor="black", linewidth=0.0, snap=False, transform=to_dots))
+    font_points = FONT_MM / MM_PER_INCH * POINTS_PER_INCH
     for (x, y), text in sheet.texts:
-        figure.text(
-            *(x, y, text), transform=to_dots, fontsize=FONT_MM / MM_PER_INCH * POINTS_PER_INCH, parse_math=False
-        )
+        figure.text(x, y, text, transform=to_dots, fontsize=font_points, parse_math=False)
     return figure
 
 
@@ -260,7 +259,7 @@ def _write_png(sheet: _Sheet, path: Path, dpi: float) -> None:
     width, height = (units * pixels_per_unit for units in sheet.units)
     if width * height > MAX_PIXELS:
         raise ValueError(
-            f"a PNG of {width}x{height} pixels is too large (limit {MAX_PIXELS:.0e}): lower the dpi, or use svg or pdf"
+            f"a PNG of {sheet.label} would have {width}x{height} pixels, more than {MAX_PIXELS:,}: use svg or pdf"
         )
     dpi = pixels_per_unit / sheet.unit_mm * MM_PER_INCH
     canvas = FigureCanvasAgg(_figure(sheet, dpi))
