@@ -9,9 +9,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
-from pipeline.detector import DetectorStep
 from pipeline.mission import Mission
-from pipeline.pose_filter import PoseFilter
 from schemas import Envelope, Topic
 from schemas.codec import AnyMessage
 from schemas.topics import ANNOTATIONS, CALIBRATION, DETECTIONS, EVENTS, FRAME, STATE, TRANSFORMS
@@ -47,7 +45,20 @@ class StepSpec:
     build: Callable[[Mission], Step]
 
 
+def _detector(mission: Mission) -> Step:
+    from pipeline.detector import DetectorStep
+
+    return DetectorStep(mission)
+
+
+def _pose_filter(mission: Mission) -> Step:
+    from pipeline.pose_filter import PoseFilter
+
+    return PoseFilter(mission)
+
+
+# Imported when built: each process loads only its own step's libraries.
 STEPS = (
-    StepSpec("detector", (CALIBRATION, FRAME), (DETECTIONS, ANNOTATIONS), DetectorStep),
-    StepSpec("pose_filter", (CALIBRATION, DETECTIONS), (STATE, TRANSFORMS, EVENTS), PoseFilter),
+    StepSpec("detector", (CALIBRATION, FRAME), (DETECTIONS, ANNOTATIONS), _detector),
+    StepSpec("pose_filter", (CALIBRATION, DETECTIONS), (STATE, TRANSFORMS, EVENTS), _pose_filter),
 )

@@ -20,7 +20,8 @@ class Topic:
     """One row of the table.
 
     ``latched``: a late subscriber is given the last value.  ``per_frame``: exactly one for every frame, so
-    that a gap in the sequence is a loss.
+    that a gap in the sequence is a loss.  ``newest_wins``: in a live run a slow reader is given the newest
+    value only.
     """
 
     name: str
@@ -30,6 +31,7 @@ class Topic:
     latched: bool = False
     recorded: bool = True
     per_frame: bool = False
+    newest_wins: bool = False
 
     def key(self, *, vehicle: str, camera: str = "*", node: str = "*") -> str:
         """Return the key expression for a vehicle, a camera and a node."""
@@ -41,7 +43,9 @@ class Topic:
         return re.fullmatch(regex, key) is not None
 
 
-FRAME = Topic("frame", "relnav/{vehicle}/camera/{camera}/frame", CompressedImage, "camera", per_frame=True)
+FRAME = Topic(
+    "frame", "relnav/{vehicle}/camera/{camera}/frame", CompressedImage, "camera", per_frame=True, newest_wins=True
+)
 CALIBRATION = Topic(
     "calibration", "relnav/{vehicle}/camera/{camera}/calibration", CameraCalibration, "once", latched=True
 )
