@@ -6,6 +6,7 @@ Everything is anti-aliased by area before it is encoded, so an edge in the linea
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import Literal
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from astratag.camera import Camera
 from astratag.geometry import (
+    CELLS,
     DRAWN_OFFSET,
     LAYERS,
     QUIET_MARGIN,
@@ -52,11 +54,11 @@ class Texture:
             self._levels.append(cv2.resize(self._levels[-1], (columns // 2, rows // 2), interpolation=cv2.INTER_AREA))
 
     def read(self, x_m: Array, y_m: Array, footprint_m: float) -> Image:
-        """Return the picture at surface points (2-D arrays), averaged over squares of side ``footprint_m``.
+        """Return the picture at surface points (2-D arrays), averaged over about ``footprint_m`` each way.
 
         Averages are symmetric, so edges keep their place.  Outside the picture its border goes on.
         """
-        level = int(np.clip(np.round(np.log2(max(footprint_m * self._texels_per_m, 1.0))), 0, len(self._levels) - 1))
+        level = int(min(np.ceil(np.log2(max(footprint_m * self._texels_per_m, 1.0))), len(self._levels) - 1))
         picture = self._levels[level]
         rows, columns = picture.shape[:2]
         scale = self._texels_per_m * columns / self._levels[0].shape[1]
@@ -130,6 +132,18 @@ def pixel_rays(camera: Camera) -> tuple[Array, Array, Array]:
     return rays, right, down
 
 
+def ray_lattice(samples: int) -> Array:
+    """Return where the rays of a pixel go (samples, 2), pixels from its centre.
+
+    A rank-1 lattice near the golden ratio: every row and every column of the pixel is sampled at ``samples`` different
+    places, so that an edge along the pixel grid is as exact as a slanted one; the mean is zero.
+    """
+    golden = (np.sqrt(5.0) - 1.0) / 2.0
+    step = min((k for k in range(1, samples + 1) if math.gcd(k, samples) == 1), key=lambda k: abs(k - golden * samples))
+    index = np.arange(samples)
+    return (np.stack([index, index * step % samples], axis=-1) + 0.5) / samples - 0.5
+
+
 def srgb_from_linear(light: Image) -> Image:
     """Return the sRGB code value (0 to 1) of linear light, which is cut off at 0 and 1."""
     light = np.clip(light, 0.0, 1.0)
@@ -153,24 +167,22 @@ def render_marker(
     background: float | NDArray[np.uint8] = 40.0,
     seed: int = 0,
     encoding: Encoding = "srgb",
-    samples: int = 3,
+    samples: int = 8,
 ) -> NDArray[np.uint8]:
     """Return a gray picture (height, width) of one evenly lit marker print, for tests and benchmarks.
 
     The print shows the 48 bits of ``signature`` in all its layers, black 0.04 and white 0.85 of full light, with its
     quiet margin, on ``surface`` (Flat by default).  ``blur_px`` is the sigma of the point spread, ``noise_sigma`` that
     of Gaussian noise in grey levels, ``background`` a grey level or picture (height, width) behind the print,
-    ``samples`` the rays a pixel each way.  The same arguments give the same picture.
+    ``samples`` the rays a pixel.  The same arguments give the same picture.
 
     Raises ValueError when a size or a shape is impossible.
     """
-    if signature.shape != (48,):
-        raise ValueError(f"signature must be the 48 bits of one marker, got shape {signature.shape}")
-    if not side_m > 0:
-        raise ValueError(f"side_m must be a positive side in metres, got {side_m}")
     levels = np.broadcast_to(np.asarray(background, dtype=np.float32), (camera.height, camera.width)) / np.float32(255)
-    light = (linear_from_srgb(levels) if encoding == "srgb" else levels).astype(np.float32)
-    _lay_print(light, camera, T_cam_marker, signature, side_m, surface or Flat(), samples)
+    light = linear_from_srgb(levels) if encoding == "srgb" else levels
+    light = lay_print(
+        light, camera, T_cam_marker, signature=signature, side_m=side_m, surface=surface or Flat(), samples=samples
+    )
     if blur_px > 0:
         light = cv2.GaussianBlur(light, (0, 0), blur_px, borderType=cv2.BORDER_REPLICATE)
     code = (srgb_from_linear(light) if encoding == "srgb" else np.clip(light, 0, 1)) * np.float32(255)
@@ -179,38 +191,46 @@ def render_marker(
     return np.clip(np.round(code), 0, 255).astype(np.uint8)
 
 
-def _lay_print(
+def lay_print(
     light: Image,
     camera: Camera,
     T_cam_marker: Array,
+    *,
     signature: NDArray[np.uint8],
     side_m: float,
     surface: Surface,
-    samples: int,
-) -> None:
-    """Lay an evenly lit print over the picture ``light``, inside the rectangle of pixels that it can touch."""
+    samples: int = 8,
+) -> Image:
+    """Return the linear picture ``light`` (height, width) with an evenly lit print over it, edges exact.
+
+    Arguments as for ``render_marker``.  Raises ValueError when a size or a shape is impossible.
+    """
+    if np.shape(signature) != (CELLS,):
+        raise ValueError(f"signature must be the {CELLS} bits of one marker, got shape {np.shape(signature)}")
+    if not side_m > 0:
+        raise ValueError(f"side_m must be a positive side in metres, got {side_m}")
+    light = np.array(light, np.float32)
     half_m = side_m * PRINT_UNITS / TEMPLATE_UNITS / 2
     window = _window(camera, T_cam_marker, surface, half_m)
     if window is None:
-        return
+        return light
     texture = _print_texture(np.ascontiguousarray(signature, np.uint8).tobytes(), side_m)
     rays, right, down = (part[window] for part in pixel_rays(camera))
     behind = light[window].copy()
     total = np.zeros_like(behind)
     T_marker_cam = inverse(T_cam_marker)
-    for dy in (np.arange(samples) + 0.5) / samples - 0.5:
-        for dx in (np.arange(samples) + 0.5) / samples - 0.5:
-            ray = rays + dx * right + dy * down
-            x, y, stretch, seen = _hit_print(surface, T_marker_cam, ray)
-            if not seen.any():
-                total += behind
-                continue
-            footprint = float(np.median(stretch[seen])) / np.sqrt(camera.K[0, 0] * camera.K[1, 1]) / samples
-            alpha = np.clip((half_m - np.abs(x)) / footprint + 0.5, 0, 1)
-            alpha *= np.clip((half_m - np.abs(y)) / footprint + 0.5, 0, 1) * seen
-            albedo = BLACK_ALBEDO + (WHITE_ALBEDO - BLACK_ALBEDO) * texture.read(x, y, footprint)
-            total += (behind + alpha * (albedo - behind)).astype(np.float32)
-    light[window] = total / np.float32(samples**2)
+    for dx, dy in ray_lattice(samples):
+        x, y, stretch, seen = _hit_print(surface, T_marker_cam, rays + dx * right + dy * down)
+        if not seen.any():
+            total += behind
+            continue
+        footprint = float(np.median(stretch[seen])) / np.sqrt(camera.K[0, 0] * camera.K[1, 1] * samples)
+        alpha = np.clip((half_m - np.abs(x)) / footprint + 0.5, 0, 1)
+        alpha *= np.clip((half_m - np.abs(y)) / footprint + 0.5, 0, 1) * seen
+        albedo = BLACK_ALBEDO + (WHITE_ALBEDO - BLACK_ALBEDO) * texture.read(x, y, footprint)
+        total += (behind + alpha * (albedo - behind)).astype(np.float32)
+    light[window] = total / np.float32(samples)
+    return light
 
 
 def _hit_print(surface: Surface, T_marker_cam: Array, rays: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
