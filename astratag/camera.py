@@ -17,6 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 DISTORTION_TERMS = 5
+SKEW_ALLOWED = 1e-6
+"""Skew, as a fraction of the focal length, that is rounding left by a calibration program."""
 PRINCIPAL_POINT_SLACK = 0.15
 """How far from the middle, as a fraction of the image, a principal point may lie and still be believed."""
 
@@ -32,10 +34,17 @@ class Camera:
 
     def __init__(self, K: ArrayLike, distortion: ArrayLike = (0.0,) * DISTORTION_TERMS, *, width: int, height: int):
         K, distortion = np.array(K, dtype=float), np.array(distortion, dtype=float).ravel()
+        if not np.isfinite(K).all():
+            raise ValueError(f"K must be finite, got {K.tolist()}")
         if K.shape != (3, 3) or not np.allclose(K[2], (0, 0, 1)):
             raise ValueError(f"K must be 3x3 with last row 0 0 1, got shape {K.shape}. Is it transposed?")
-        if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
-            raise ValueError(f"K must be finite with positive focal lengths, got fx {K[0, 0]}, fy {K[1, 1]}")
+        if K[0, 0] <= 0 or K[1, 1] <= 0:
+            raise ValueError(f"K must have positive focal lengths, got fx {K[0, 0]}, fy {K[1, 1]}")
+        if max(abs(K[0, 1]), abs(K[1, 0])) > SKEW_ALLOWED * K[0, 0]:
+            raise ValueError(
+                f"K must have no skew, got {K[0, 1]} and {K[1, 0]} off the diagonal: the model is OpenCV's"
+            )
+        K[0, 1] = K[1, 0] = 0.0
         if distortion.size not in (0, 4, DISTORTION_TERMS) or not np.isfinite(distortion).all():
             raise ValueError(
                 f"distortion must be 5 finite terms (k1, k2, p1, p2, k3), got {distortion.size}: "
@@ -56,7 +65,8 @@ class Camera:
 
         Given the images' width and height, the camera returned is for that size: a calibration of another
         size is refused, or scaled when ``scale`` says that the picture was only resized.  The reference's
-        JSON does not tell its size; the principal point must then lie near the middle of the images.
+        JSON does not tell its size; the principal point must then lie near the middle of the images, and
+        without images to compare the size is twice the principal point.
         Raises ValueError with what is missing or wrong.
         """
         path = Path(path)
@@ -70,13 +80,16 @@ class Camera:
             distortion = _numbers(data.get("distortion_coefficients", ()))
             model = data.get("distortion_model", "plumb_bob")
             size = (int(data.get("image_width", 0)), int(data.get("image_height", 0)))
-        except (KeyError, TypeError, AttributeError, ValueError) as error:
+        except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
             raise ValueError(f"camera file {path} has no readable camera_matrix and distortion_coefficients") from error
         if model not in ("plumb_bob", ""):
             raise ValueError(f"camera file {path}: distortion model {model!r} is not supported, only plumb_bob")
         if not all(size):
             size = _size_from_principal_point(K, width, height)
-        camera = cls(K, distortion, width=size[0], height=size[1])
+        try:
+            camera = cls(K, distortion, width=size[0], height=size[1])
+        except ValueError as error:
+            raise ValueError(f"camera file {path}: {error}") from error
         if width is None or height is None:
             return camera
         if scale:
@@ -103,14 +116,30 @@ class Camera:
 
     def project(self, points_cam: Array) -> Array:
         """Return pixels (N, 2) of points (N, 3) in the camera frame, which must lie in front of it (z > 0)."""
-        points = np.ascontiguousarray(points_cam, dtype=float).reshape(-1, 1, 3)
+        points = np.ascontiguousarray(points_cam, dtype=float).reshape(-1, 3)
+        if not (self.distortion.any() and len(points)):
+            return (points[:, :2] / points[:, 2:]) @ self.K[:2, :2].T + self.K[:2, 2]
         zero = np.zeros(3)
-        return cv2.projectPoints(points, zero, zero, self.K, self.distortion)[0].reshape(-1, 2)
+        return cv2.projectPoints(points.reshape(-1, 1, 3), zero, zero, self.K, self.distortion)[0].reshape(-1, 2)
+
+    def projection_jacobian(self, points_cam: Array) -> Array:
+        """Return d pixel / d point (N, 2, 3), px per metre, at points (N, 3) in the camera frame (z > 0)."""
+        points = np.asarray(points_cam, dtype=float).reshape(-1, 3)
+        if self.distortion.any():
+            zero = np.zeros(3)
+            by_all = cv2.projectPoints(points.reshape(-1, 1, 3), zero, zero, self.K, self.distortion)[1]
+            return by_all[:, 3:6].reshape(-1, 2, 3)  # a shift of the point is a shift of OpenCV's translation
+        x, y, z = points.T
+        z = np.maximum(z, 1e-9)
+        J = np.zeros((len(points), 2, 3))
+        J[:, 0] = np.stack([self.K[0, 0] / z, self.K[0, 1] / z, -(self.K[0, 0] * x + self.K[0, 1] * y) / z**2], axis=1)
+        J[:, 1] = np.stack([np.zeros_like(z), self.K[1, 1] / z, -self.K[1, 1] * y / z**2], axis=1)
+        return J
 
     def undistort(self, points_px: Array) -> Array:
         """Return where pixels (N, 2) would be without distortion, in normalised coordinates x/z, y/z (N, 2)."""
         points = np.ascontiguousarray(points_px, dtype=float).reshape(-1, 1, 2)
-        if not self.distortion.any():
+        if not (self.distortion.any() and len(points)):
             return (points.reshape(-1, 2) - self.K[:2, 2]) @ np.linalg.inv(self.K[:2, :2]).T
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-12)
         return cv2.undistortPoints(points, self.K, self.distortion, criteria=criteria).reshape(-1, 2)

@@ -34,7 +34,7 @@ def published_signature(message: int) -> NDArray[np.uint8]:
     return np.array([int(bit) for bit in text], dtype=np.uint8)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Dictionary:
     """A set of marker codes.
 
@@ -46,10 +46,17 @@ class Dictionary:
     signatures: NDArray[np.uint8] = field(repr=False)
 
     def __post_init__(self) -> None:
+        if not self.ids:
+            raise ValueError(f"dictionary {self.family!r} holds no markers")
+        if not np.isin(self.signatures, (0, 1)).all():
+            raise ValueError(f"dictionary {self.family!r} has cells that are neither 0 nor 1")
         if self.signatures.shape != (len(self.ids), CELLS):
             raise ValueError(
                 f"signatures must be ({len(self.ids)}, {CELLS}), got {self.signatures.shape}: one row of cells an id"
             )
+        signatures = np.array(self.signatures, dtype=np.uint8)
+        signatures.flags.writeable = False
+        object.__setattr__(self, "signatures", signatures)
         if len(set(self.ids)) != len(self.ids):
             raise ValueError(f"dictionary {self.family!r} lists an id twice")
         rows = self.oriented.reshape(-1, CELLS)

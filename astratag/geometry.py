@@ -110,6 +110,7 @@ def cell_polygons() -> NDArray[np.float64]:
 
 def turn_clockwise(bits: NDArray[np.uint8], quarter_turns: int = 1) -> NDArray[np.uint8]:
     """Return what a code (..., 48) reads when its print is turned clockwise by quarter turns."""
+    bits = bits.copy()
     for _ in range(quarter_turns % 4):
         turned = np.empty_like(bits)
         turned[..., TURN_CLOCKWISE] = bits

@@ -1,4 +1,4 @@
-"""The surface a marker is stuck to: from the flat print to points in the marker frame, and back along rays.
+"""The surface a marker is stuck to: from the flat print to points in the marker frame.
 
 Print coordinates are metres from the centre, x right, y up.  The marker frame is tangent to the surface at
 that centre; a print is wrapped without stretching.

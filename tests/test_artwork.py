@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from matplotlib.path import Path as Outline
 from PIL import Image
 
-from astratag.artwork import artwork_image, ink_outlines, write_artwork
+from astratag.artwork import CROP_MM, artwork_image, ink_outlines, write_artwork
 from astratag.dictionary import load_dictionary
 from astratag.geometry import LAYERS, QUIET_MARGIN, cell_polygons, layer_points, square
+from pipeline.render import print_coverage
 
 DICTIONARY = load_dictionary()
 SIDE_MM = 87.3
@@ -71,7 +72,7 @@ def test_raster_reads_as_its_signature_in_every_layer(marker_id):
     assert (cells_read(artwork_image(signature)) == signature).all()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(signatures)
 def test_ink_is_the_square_less_frames_and_white_cells(signature):
     """The signed areas of the outlines add up to the ink of the metric model."""
@@ -85,7 +86,7 @@ def test_ink_is_the_square_less_frames_and_white_cells(signature):
     assert sum(map(signed_area, ink_outlines(signature))) == pytest.approx(expected, abs=2.0)  # arcs are chords
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(signatures)
 def test_colour_at_each_cell_is_its_bit_by_both_fill_rules(signature):
     outlines = ink_outlines(signature)
@@ -244,3 +245,16 @@ def test_refuses_what_it_cannot_print_and_writes_nothing(tmp_path, change, messa
 def test_refuses_a_signature_of_another_length():
     with pytest.raises(ValueError, match="48 cells"):
         artwork_image(np.zeros(36, np.uint8))
+
+
+@pytest.mark.parametrize("marker_id", [0, 11])
+def test_the_printed_marker_is_the_simulated_one(tmp_path, marker_id):
+    """The simulated camera paints its prints by itself: the same ink to a third of a pixel anywhere, on average none."""
+    path = write_artwork(DICTIONARY, marker_id, tmp_path / "marker.png", side_m=0.1)
+    printed = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(float)
+    simulated = print_coverage(DICTIONARY.signature(marker_id), texels_per_unit=2)
+    border = 2 * int(np.ceil(CROP_MM / (100 / 700)))
+    size = len(simulated)
+    difference = printed[border : border + size, border : border + size] - simulated
+    assert np.abs(difference).max() < 0.34 * 255
+    assert np.abs(difference).mean() < 0.1
