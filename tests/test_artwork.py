@@ -249,12 +249,13 @@ def test_refuses_a_signature_of_another_length():
 
 @pytest.mark.parametrize("marker_id", [0, 11])
 def test_the_printed_marker_is_the_simulated_one(tmp_path, marker_id):
-    """The simulated camera paints its prints by itself: the same ink to a third of a pixel anywhere, on average none."""
+    """The simulated camera paints its prints by other code: the same ink, but for the dots at the cells' tips."""
     path = write_artwork(DICTIONARY, marker_id, tmp_path / "marker.png", side_m=0.1)
     printed = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(float)
     simulated = print_coverage(DICTIONARY.signature(marker_id), texels_per_unit=2)
     border = 2 * int(np.ceil(CROP_MM / (100 / 700)))
     size = len(simulated)
     difference = printed[border : border + size, border : border + size] - simulated
-    assert np.abs(difference).max() < 0.34 * 255
+    assert np.abs(difference).max() < 0.5 * 255
+    assert np.mean(np.abs(difference) > 0.2 * 255) < 1e-4
     assert np.abs(difference).mean() < 0.1
