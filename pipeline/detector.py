@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 import astratag.detection
 from astratag.camera import Camera
 from astratag.detector import Detector, MarkerSpec
-from astratag.dictionary import load_dictionary
 from astratag.tracker import Tracker
 from pipeline.convert import camera_from_calibration, detection_message
 from pipeline.mission import Mission
@@ -42,7 +41,7 @@ def decode_gray(data: bytes) -> NDArray[np.uint8]:
 def mission_detector(mission: Mission) -> Detector:
     """Return a detector for a mission's dictionary and markers.  Raises ValueError for an unknown dictionary."""
     return Detector(
-        load_dictionary(mission.dictionary),
+        mission.dictionary,
         mission.default_side_m,
         markers={m.id: MarkerSpec(m.side_m, m.surface.surface()) for m in mission.markers},
         transfer=mission.camera.transfer,
