@@ -102,10 +102,17 @@ class FilterSection(Section):
     """Standard deviation of the relative acceleration, white over ``correlation_s``."""
     angular_acceleration_rad_s2: float = Field(default=0.05, gt=0)
     correlation_s: float = Field(default=0.2, gt=0)
+    edge_bias_px: float = Field(default=0.03, ge=0)
+    """How far the edges of every black square may be measured outside or inside their place, all by the same."""
+    edge_bias_correlation_s: float = Field(default=5.0, gt=0)
     initial_speed_m_s: float = Field(default=0.2, gt=0)
     initial_rate_rad_s: float = Field(default=0.2, gt=0)
     gate_probability: float = Field(default=0.999, gt=0.5, lt=1)
     """Share of true measurements that a gate lets through."""
+    ambiguity_ratio: float = Field(default=1e4, gt=1)
+    """How many times likelier one of two poses must become before the other is dropped."""
+    reset_after_frames: int = Field(default=5, gt=0)
+    """Frames refused in a row, all measurements or the stamp, that make the filter start again."""
     coast_s: float = Field(default=5.0, gt=0)
     """Longest propagation without measurements before LOST."""
 

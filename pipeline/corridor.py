@@ -1,0 +1,61 @@
+"""From the relative state to what a docking controller watches: port-to-port quantities and the approach corridor.
+
+Port frames have z out of their vehicle.  Docked and unrolled, the ports face each other with their x axes parallel.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astratag.transforms import inverse, transform
+from pipeline.mission import CorridorSection, Mission
+from schemas import PortToPort
+
+Array = NDArray[np.float64]
+
+CONTACT_M = 1e-6
+"""Closer than this the line of sight has no direction, and the port axis stands for it."""
+
+
+def port_to_port(
+    mission: Mission,
+    T_chaser_target: Array,
+    v_chaser_target_m_s: Array,
+    omega_chaser_target_in_target_rad_s: Array,
+) -> PortToPort:
+    """Return the chaser's port as seen from the target's, with its motion and where it is in the corridor.
+
+    ``T_chaser_target`` (4, 4), ``v_chaser_target_m_s`` (3,) in chaser axes, the rate (3,) in target axes.  Speeds are
+    as an observer on the target's port sees them.  ``roll_rad`` is the turn of the chaser port's x axis about the
+    target port's z, from the target port's x.
+    """
+    T_target_port, T_chaser_port = mission.T_target_port.matrix(), mission.T_chaser_port.matrix()
+    T_target_chaser = inverse(T_chaser_target)
+    T_port_target = inverse(T_target_port)
+    T_targetport_chaserport = T_port_target @ T_target_chaser @ T_chaser_port
+
+    p = T_targetport_chaserport[:3, 3]
+    p_target = transform(T_target_chaser, T_chaser_port[:3, 3])
+    v_target = -T_target_chaser[:3, :3] @ v_chaser_target_m_s - np.cross(omega_chaser_target_in_target_rad_s, p_target)
+    v = T_port_target[:3, :3] @ v_target
+
+    range_m, lateral_m = float(np.linalg.norm(p)), float(np.hypot(p[0], p[1]))
+    sight = p / range_m if range_m > CONTACT_M else np.array([0.0, 0.0, 1.0])
+    chaser_x, chaser_z = T_targetport_chaserport[:3, 0], T_targetport_chaserport[:3, 2]
+    return PortToPort(
+        range_m=range_m,
+        axial_m=float(p[2]),
+        lateral_m=lateral_m,
+        closing_speed_m_s=-float(sight @ v),
+        lateral_speed_m_s=float(np.hypot(v[0], v[1])),
+        misalignment_rad=float(np.arctan2(np.hypot(chaser_z[0], chaser_z[1]), -chaser_z[2])),
+        roll_rad=float(np.arctan2(chaser_x[1], chaser_x[0])),
+        corridor_angle_rad=float(np.arctan2(lateral_m, p[2])),
+        in_corridor=in_corridor(mission.corridor, axial_m=float(p[2]), lateral_m=lateral_m),
+    )
+
+
+def in_corridor(corridor: CorridorSection, *, axial_m: float, lateral_m: float) -> bool:
+    """Tell whether a place is inside the corridor: before the port, and inside the cone, which goes on for ever."""
+    return axial_m >= 0 and lateral_m <= corridor.port_radius_m + axial_m * float(np.tan(corridor.half_angle_rad))

@@ -1,0 +1,139 @@
+"""The poses that explain what is seen: one, or two while a planar marker leaves it open which way it is tilted.
+
+Each pose is a filter of its own; measurements move their probabilities until one is so much likelier that the other
+is dropped, or until the two have become one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astratag.transforms import inverse
+from pipeline.corner_filter import CORNER_DOF, CornerFilter, Eye, SeenLayer, Update
+from pipeline.dynamics import ATTITUDE
+from pipeline.mission import FilterSection
+
+Array = NDArray[np.float64]
+
+POSE_DOF = 6
+START_MISFIT = 25.0
+"""A first pose whose squared residuals are this many times what their noise explains is not believed."""
+ONE_MODE = 2.0
+"""Squared distance, in units of the summed covariances, below which two equal Gaussians have a single mode: each is
+then within two of its own standard deviations of the other."""
+
+
+class HypothesisBank:
+    """One or two filters with their logarithmic weights, the likeliest first."""
+
+    def __init__(self, filters: list[CornerFilter], log_weights: list[float], noise: FilterSection):
+        self.filters, self._log_weights, self._noise = filters, log_weights, noise
+        self._sort_and_prune()
+
+    @classmethod
+    def start(
+        cls, guesses: Sequence[Array], layers: Sequence[SeenLayer], eye: Eye, noise: FilterSection
+    ) -> HypothesisBank | None:
+        """Return the poses that guesses T_chaser_target (4, 4) lead to on the corners; None when none fits them."""
+        found: list[tuple[float, CornerFilter]] = []
+        for guess in guesses:
+            seen_from = eye.T_cam_chaser @ guess
+            candidate = CornerFilter.start(guess, float(np.linalg.norm(seen_from[:3, 3])), noise)
+            if candidate.update(layers, eye) is not None:
+                found.append((candidate.misfit(layers, eye), candidate))
+        found.sort(key=lambda pair: pair[0])
+        dof = CORNER_DOF * len(layers) - POSE_DOF
+        if not found or not found[0][0] < START_MISFIT * dof:
+            return None
+        best_misfit, best = found[0]
+        scale = max(1.0, best_misfit / dof)
+        rival = next((pair for pair in found[1:] if not is_one_mode(best, pair[1])), None)
+        if rival is None:
+            return cls([best], [0.0], noise)
+        return cls([best, rival[1]], [-best_misfit / scale / 2, -rival[0] / scale / 2], noise)
+
+    @property
+    def best(self) -> CornerFilter:
+        """Return the likeliest filter."""
+        return self.filters[0]
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Tell whether two poses are still possible."""
+        return len(self.filters) > 1
+
+    @property
+    def probability(self) -> float:
+        """Return that of the likeliest pose."""
+        weights = np.exp(np.array(self._log_weights) - self._log_weights[0])
+        return float(1.0 / weights.sum())
+
+    def copy(self) -> HypothesisBank:
+        """Return a bank of its own in the same state."""
+        return HypothesisBank([f.copy() for f in self.filters], list(self._log_weights), self._noise)
+
+    def predict(self, dt_s: float) -> None:
+        """Let ``dt_s`` seconds pass."""
+        for hypothesis in self.filters:
+            hypothesis.predict(dt_s)
+
+    def gate(self, layers: Sequence[SeenLayer], eye: Eye) -> Array:
+        """Return the normalised innovation squared of each layer under the pose that it fits best."""
+        return np.min([hypothesis.gate(layers, eye) for hypothesis in self.filters], axis=0)
+
+    def update(self, layers: Sequence[SeenLayer], eye: Eye) -> Update | None:
+        """Take the same measurements into every filter; return what the likeliest made of them, None if nothing.
+
+        Where even the better pose fits worse than the corner noise explains, likelihoods count in units of its own
+        misfit, so that an underestimated noise cannot decide between the poses.
+        """
+        kept = [
+            (update, hypothesis, weight)
+            for hypothesis, weight in zip(self.filters, self._log_weights, strict=True)
+            if (update := hypothesis.update(layers, eye)) is not None
+        ]
+        if not kept:
+            return None
+        scale = max(1.0, min(update.nis / update.dof for update, _, _ in kept))
+        self.filters = [hypothesis for _, hypothesis, _ in kept]
+        self._log_weights = [weight + update.log_likelihood / scale for update, _, weight in kept]
+        updates = {id(hypothesis): update for update, hypothesis, _ in kept}
+        self._sort_and_prune()
+        return updates[id(self.best)]
+
+    def _sort_and_prune(self) -> None:
+        order = np.argsort([-weight for weight in self._log_weights], kind="stable")
+        self.filters = [self.filters[k] for k in order]
+        self._log_weights = [self._log_weights[k] - self._log_weights[order[0]] for k in order]
+        unlikely = self._log_weights[-1] < -np.log(self._noise.ambiguity_ratio)
+        if self.is_ambiguous and (unlikely or is_one_mode(*self.filters)):
+            if not unlikely:
+                self.best.widen(self.filters[1], 1.0 - self.probability)
+            del self.filters[1:], self._log_weights[1:]
+
+
+def is_one_mode(a: CornerFilter, b: CornerFilter) -> bool:
+    """Tell whether two filters' attitudes are so near, for their uncertainty, that they are one pose."""
+    apart = a.motion.error_of(b.motion)[ATTITUDE]
+    spread = a.covariance[ATTITUDE, ATTITUDE] + b.covariance[ATTITUDE, ATTITUDE]
+    return float(apart @ np.linalg.solve(spread, apart)) < ONE_MODE
+
+
+def mirrored_pose(T_cam_marker: Array) -> Array:
+    """Return the other pose under which a small flat marker looks the same: its tilt reversed about the line of sight.
+
+    Source: D. Oberkampf, D. DeMenthon, L. Davis, "Iterative pose estimation using coplanar feature points", 1996.
+    """
+    T = T_cam_marker.copy()
+    sight = T[:3, 3] / np.linalg.norm(T[:3, 3])
+    T[:3, :3] = (np.eye(3) - 2 * np.outer(sight, sight)) @ T[:3, :3] @ np.diag([1.0, 1.0, -1.0])
+    return T
+
+
+def guesses_in_chaser(poses_cam_marker: Sequence[Array], eye: Eye, T_marker_target: Array) -> list[Array]:
+    """Return T_chaser_target of poses T_cam_marker (4, 4) to start from, and of the mirror image of the first."""
+    T_chaser_cam = inverse(eye.T_cam_chaser)
+    return [T_chaser_cam @ T @ T_marker_target for T in (*poses_cam_marker, mirrored_pose(poses_cam_marker[0]))]
