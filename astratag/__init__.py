@@ -1,1 +1,21 @@
 """The AstraTag marker: geometry, codes, artwork, camera model, detection and pose.  Knows no transport."""
+
+from astratag.camera import Camera
+from astratag.detection import Detection, LayerDetection, PlanarPose
+from astratag.detector import Detector, MarkerSpec
+from astratag.dictionary import Dictionary, load_dictionary
+from astratag.surface import Cylinder, Flat, Surface
+
+__all__ = [
+    "Camera",
+    "Cylinder",
+    "Detection",
+    "Detector",
+    "Dictionary",
+    "Flat",
+    "LayerDetection",
+    "MarkerSpec",
+    "PlanarPose",
+    "Surface",
+    "load_dictionary",
+]

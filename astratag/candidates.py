@@ -1,0 +1,105 @@
+"""Candidates: what rough quads read, as if flat, and bent through thin-plate splines where that fails."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astratag.align import align
+from astratag.geometry import TEMPLATE_UNITS, square
+from astratag.signature import ACCEPT_OF_MANY_WARPS, SAMPLES, Artwork, Codebook, Reading, Warp, cell_values
+from astratag.tps import KNOTS, ThinPlate, ThinPlateWarp, bent_places
+from astratag.warp import BentWarp, HomographyWarp
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+PROMISING = 0.5
+"""Correlation through a rough quad from which a candidate is worth fitting."""
+MAX_CANDIDATES = 12
+FAINT = 0.25
+"""Correlation as if flat from which a quad is worth bending."""
+MAX_BENT = 3
+LEAST_BENT_SIDE_PX = 24.0
+OUTER = square(0.0, TEMPLATE_UNITS)
+
+_PLATE = ThinPlate(KNOTS)
+_BENT_SAMPLES = _PLATE.basis(SAMPLES)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A square that may be a layer of a marker: what it reads, and its corners (4, 2) in the marker's order.
+
+    ``warp`` is what it was read through, taking the whole template onto the square.
+    """
+
+    reading: Reading
+    corners_px: Array
+    warp: Warp
+    bent: bool = False
+
+
+def flat_candidates(gray: Image, quads: Array, codebook: Codebook) -> tuple[list[Candidate], list[Candidate]]:
+    """Return the quads (Q, 4, 2) that read something like a code, and those that do only faintly, the best first."""
+    if len(quads) == 0:
+        return [], []
+    warps = [HomographyWarp.from_points(OUTER, quad) for quad in quads]
+    cells = cell_values(gray, np.stack([warp(SAMPLES) for warp in warps]))
+    candidates = [_turned(reading, quad) for reading, quad in zip(codebook.read(cells), quads, strict=True)]
+    candidates.sort(key=lambda c: -c.reading.correlation)
+    promising = [c for c in candidates if c.reading.correlation >= PROMISING]
+    faint = [c for c in candidates if FAINT <= c.reading.correlation < PROMISING]
+    return promising[:MAX_CANDIDATES], faint
+
+
+def _turned(reading: Reading, quad: Array) -> Candidate:
+    """Return a candidate with its corners turned from the order they were read in to the marker's own."""
+    corners_px = np.roll(quad, -reading.quarter_turns, axis=0)
+    return Candidate(reading, corners_px, HomographyWarp.from_points(OUTER, corners_px))
+
+
+def bent_candidates(gray: Image, faint: Sequence[Candidate], codebook: Codebook, artwork: Artwork) -> list[Candidate]:
+    """Return those of the faint candidates that read well once bent and aligned, the best first."""
+    large = [candidate for candidate in faint if _side_px(candidate) >= LEAST_BENT_SIDE_PX]
+    found = [_bend(gray, candidate, codebook, artwork) for candidate in large[:MAX_BENT]]
+    return sorted((c for c in found if c is not None), key=lambda c: -c.reading.correlation)
+
+
+def _side_px(candidate: Candidate) -> float:
+    """Return the mean length of a candidate's sides."""
+    corners = candidate.corners_px
+    return float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
+
+
+def _bend(gray: Image, candidate: Candidate, codebook: Codebook, artwork: Artwork) -> Candidate | None:
+    """Return a faint candidate read through a warp that bends, None when that reads no better than chance.
+
+    It is tried as it is and through the thin-plate spline that reads best, each aligned with the artwork of
+    the code it is taken for.
+    """
+    best: Candidate | None = None
+    for start in (candidate, _through_splines(gray, candidate, codebook)):
+        marker_id = start.reading.marker_id
+        warp = BentWarp.from_points(KNOTS, start.warp(KNOTS))
+        warp = align(gray, warp, artwork.points, artwork.expected(marker_id)[0])
+        reading = codebook.read_as(cell_values(gray, warp(SAMPLES)[None])[0], marker_id)
+        if reading.correlation >= ACCEPT_OF_MANY_WARPS and (
+            best is None or reading.correlation > best.reading.correlation
+        ):
+            best = Candidate(reading, warp(OUTER), warp, bent=True)
+    return best
+
+
+def _through_splines(gray: Image, candidate: Candidate, codebook: Codebook) -> Candidate:
+    """Return what a quad reads through the best of all thin-plate splines."""
+    corners = candidate.corners_px
+    places = bent_places(candidate.warp(KNOTS), corners)
+    readings = codebook.read(cell_values(gray, _BENT_SAMPLES @ places))
+    best = max(range(len(readings)), key=lambda i: readings[i].correlation)
+    turns = readings[best].quarter_turns
+    knots = np.roll(np.arange(len(KNOTS)).reshape(-1, 4), -turns, axis=1).ravel()  # knots come in fours, like corners
+    return Candidate(readings[best], np.roll(corners, -turns, axis=0), ThinPlateWarp(_PLATE, places[best][knots]))

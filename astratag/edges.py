@@ -1,0 +1,194 @@
+"""Edges of a marker: the twenty straight lines of its print, and where they are in an image to a few hundredths.
+
+Each edge is sampled at fixed points along it.  Through each point a short profile is taken across the edge,
+in linear light, and the place of steepest rise from ink to paper is found between samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from astratag.geometry import LAYERS, QUIET_MARGIN, TEMPLATE_UNITS, square
+from astratag.warp import FittedWarp
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Image = NDArray[np.uint8]
+Transfer = Literal["srgb", "linear"]
+
+POINTS_PER_EDGE = 32
+END_MARGIN = 0.08
+"""Fraction of an edge left out at either end, where corners are round and blurred."""
+STEP_PX = 0.5
+SMOOTHING_PX = 0.7
+"""Standard deviation of the derivative filter: little, so that neighbouring edges do not pull."""
+BORDER_UNITS = 50.0
+"""Ink between a black square's edge and the nearest cell, in units of its own layer."""
+
+
+@dataclass(frozen=True)
+class Edge:
+    """One side of a square: from ``start`` to ``end`` clockwise in the template, ink on one side of it."""
+
+    layer: int
+    side: int
+    """0 top, 1 right, 2 bottom, 3 left."""
+    frame: bool
+    """True for the outer edge of a white frame, which has ink outside; False for a black square's edge."""
+    start: tuple[float, float]
+    end: tuple[float, float]
+    reach: float
+    """Distance to the nearest other edge on either side, template units."""
+
+
+def _edges() -> tuple[Edge, ...]:
+    edges: list[Edge] = []
+    for layer in LAYERS:
+        border = BORDER_UNITS * layer.scale
+        squares = [(False, layer.black, QUIET_MARGIN * TEMPLATE_UNITS)]
+        if layer.frame is not None:
+            thickness = layer.black[0] - layer.frame[0]
+            parent = LAYERS[layer.index - 1]
+            ring = layer.frame[0] - (parent.origin + parent.scale * 150.0)  # the parent's cells end at 150
+            squares = [(False, layer.black, thickness), (True, layer.frame, min(thickness, ring))]
+        for frame, (near, far), outside in squares:
+            corners = square(near, far)
+            reach = outside if frame else min(border, outside)
+            for side in range(4):
+                start, end = tuple(corners[side]), tuple(corners[(side + 1) % 4])
+                edges.append(Edge(layer.index, side, frame, start, end, reach))
+    return tuple(edges)
+
+
+EDGES = _edges()
+ALONG = np.linspace(END_MARGIN, 1 - END_MARGIN, POINTS_PER_EDGE)
+_STARTS, _ENDS = np.array([e.start for e in EDGES]), np.array([e.end for e in EDGES])
+EDGE_POINTS = _STARTS[:, None, :] + ALONG[None, :, None] * (_ENDS - _STARTS)[:, None, :]
+"""Sampling points (20, 32, 2), template units."""
+EDGE_LAYER = np.array([e.layer for e in EDGES])
+EDGE_IS_FRAME = np.array([e.frame for e in EDGES])
+EDGE_REACH = np.array([e.reach for e in EDGES])
+EDGE_LENGTH = np.linalg.norm(_ENDS - _STARTS, axis=1)
+
+
+def inverse_transfer(transfer: Transfer) -> NDArray[np.float32]:
+    """Return the table (256,) from gray values to linear light, 0..255.
+
+    "srgb" undoes the curve of ordinary 8-bit cameras (IEC 61966-2-1), which moves a black-white edge 0.2 to
+    0.4 pixels into the black.
+    """
+    code = np.arange(256) / 255.0
+    if transfer == "linear":
+        light = code
+    elif transfer == "srgb":
+        light = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+    else:
+        raise ValueError(f"transfer must be 'srgb' or 'linear', got {transfer!r}")
+    return (255.0 * light).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class EdgePoints:
+    """Where the edges were found: E edges of M points each.
+
+    ``offset_px`` (E, M) is the distance from the predicted point along ``normal`` (E, M, 2), the image unit
+    vector from ink to paper; only where ``found``, which is only where ``in_view``.  ``edge`` (E,) indexes
+    ``EDGES``; ``length_px`` and ``reach_px`` (E,) are how long it looks and how far from its neighbours.
+    """
+
+    edge: NDArray[np.int64]
+    predicted_px: Array
+    normal: Array
+    offset_px: Array
+    found: Mask
+    in_view: Mask
+    length_px: Array
+    reach_px: Array
+
+
+def locate(light: NDArray[np.float32], warp: FittedWarp, edges: NDArray[np.int64], search_px: float) -> EdgePoints:
+    """Look for ``edges`` (indices of ``EDGES``) up to ``search_px`` from where ``warp`` predicts them.
+
+    ``light`` is the image in linear light.  An edge is never looked for beyond its own reach, so that
+    neighbours are not taken for it.
+    """
+    template = EDGE_POINTS[edges]
+    predicted = warp(template)
+    tangent = np.gradient(predicted, axis=1)
+    spacing = np.linalg.norm(tangent, axis=2)
+    length_px = spacing.mean(axis=1) * (POINTS_PER_EDGE - 1) / (1 - 2 * END_MARGIN)
+    outward = np.stack([tangent[..., 1], -tangent[..., 0]], axis=2) / np.maximum(spacing, 1e-9)[..., None]
+    normal = np.where(EDGE_IS_FRAME[edges, None, None], -outward, outward)
+    inward_units = template + np.where(EDGE_IS_FRAME[edges], 1.0, -1.0)[:, None, None] * _template_outward(edges)
+    # pixels a template unit spans across the edge: small where the print is seen at a slant
+    across = np.abs(((warp(inward_units) - predicted) * normal).sum(axis=2))
+    reach_px = (EDGE_REACH[edges, None] * across).min(axis=1)
+
+    half = int(np.ceil((search_px + 3 * SMOOTHING_PX) / STEP_PX))
+    steps = np.arange(-half, half + 1) * STEP_PX
+    at = predicted[:, :, None, :] + steps[None, None, :, None] * normal[:, :, None, :]
+    height, width = light.shape
+    ends = at[:, :, [0, -1], :]
+    inside = ((ends >= 0) & (ends <= (width - 1, height - 1))).all(axis=(2, 3))
+    profile = cv2.remap(
+        light,
+        np.clip(at, -1e4, 1e4).astype(np.float32).reshape(-1, len(steps), 2),
+        None,
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    ).reshape(at.shape[:3])
+    offset, rise = _steepest_rise(profile, np.minimum(search_px, 0.6 * reach_px))
+    visible = warp.visible(template.reshape(-1, 2)).reshape(template.shape[:2])
+    in_view = inside & visible
+    found = in_view & np.isfinite(offset) & (rise > _least_rise(rise))
+    return EdgePoints(edges, predicted, normal, np.where(found, offset, 0.0), found, in_view, length_px, reach_px)
+
+
+def _template_outward(edges: NDArray[np.int64]) -> Array:
+    """Return the outward unit normals (E, 1, 2) of edges in the template."""
+    return np.array([(0.0, -1.0), (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0)])[[EDGES[e].side for e in edges]][:, None, :]
+
+
+def _least_rise(rise: Array) -> Array:
+    """Return how steep (E, 1) a rise must be: a fraction of what is typical of its own edge."""
+    typical = np.nanmedian(np.where(np.isfinite(rise), rise, 0.0), axis=1, keepdims=True)
+    return np.maximum(0.35 * typical, 0.05)
+
+
+def _derivative_filter(samples: int) -> Array:
+    """Return the matrix (samples, samples) that takes a profile to its smoothed slope, per pixel."""
+    x = (np.arange(samples)[:, None] - np.arange(samples)[None, :]) * STEP_PX
+    g = -x / SMOOTHING_PX**2 * np.exp(-0.5 * (x / SMOOTHING_PX) ** 2)
+    return (g / (np.sqrt(2 * np.pi) * SMOOTHING_PX) * STEP_PX).T
+
+
+_FILTERS: dict[int, NDArray[np.float32]] = {}
+
+
+def _steepest_rise(profile: NDArray[np.float32], limit_px: Array) -> tuple[Array, Array]:
+    """Return where (E, M) the profile (E, M, S) rises most, in pixels from its middle, and how steeply there.
+
+    The place is NaN where the steepest rise lies at the limit (E,) of the search: it is something else's.
+    """
+    samples = profile.shape[2]
+    if samples not in _FILTERS:
+        _FILTERS[samples] = _derivative_filter(samples).astype(np.float32)
+    slope = profile @ _FILTERS[samples]
+    steps = (np.arange(samples) - samples // 2) * STEP_PX
+    allowed = (np.abs(steps)[None, :] <= limit_px[:, None] + 1e-9) & (
+        np.abs(steps) <= steps[-1] - 3 * SMOOTHING_PX + 0.3
+    )
+    slope_allowed = np.where(allowed[:, None, :], slope, -np.inf)
+    best = slope_allowed.argmax(axis=2)
+    best = np.clip(best, 1, samples - 2)
+    pick = np.take_along_axis
+    below, peak, above = (pick(slope, (best + d)[..., None], axis=2)[..., 0] for d in (-1, 0, 1))
+    curvature = 2 * peak - below - above
+    is_peak = (below < peak) & (above <= peak) & (curvature > 0)
+    shift = np.where(is_peak, 0.5 * (above - below) / np.where(curvature > 0, curvature, 1.0), np.nan)
+    return steps[best] + shift * STEP_PX, np.asarray(peak, dtype=float)

@@ -1,0 +1,171 @@
+"""Fitting a warp to the edges of a marker, robustly, and measuring each layer's corners with it.
+
+Residuals are distances across the edges, in pixels.  Besides the warp's own parameters the fit carries one
+*edge bias*: how far all edges lie towards the paper.  What is left of a camera's response curve moves every
+black-white edge the same way, and black squares and white frames feel it with opposite signs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astratag.detection import LayerDetection
+from astratag.edges import ALONG, EDGE_POINTS, EDGES, POINTS_PER_EDGE, EdgePoints, locate
+from astratag.geometry import LAYERS, square
+from astratag.warp import FittedWarp
+
+Array = NDArray[np.float64]
+W = TypeVar("W", bound=FittedWarp)
+
+BIAS_SIGMA_PX = 0.04
+"""Prior standard deviation of the edge bias: what a known response curve leaves."""
+NOISE_FLOOR_PX = 0.03
+"""No edge point is believed to be better than this."""
+CORRELATION_LENGTH_PX = 1.6
+"""Edge points nearer than this along an edge share their noise (blur, JPEG blocks)."""
+CORNER_FLOOR_PX = 0.02
+"""What a corner's standard deviation never falls below: print, lens model, neighbouring edges."""
+TUKEY = 4.685
+"""Residuals beyond this many standard deviations weigh nothing (95 % efficiency on Gaussian noise)."""
+REWEIGHTINGS = 4
+SHARP_REACH_PX, LEAST_REACH_PX = 3.2, 1.2
+"""An edge this far from its neighbours is sharp; nearer, they pull, and below the least it is no edge of its own."""
+LEAST_FOUND = 0.4
+"""Fraction of an edge's points that must be found for it to count."""
+COST_UNIT_PX, COST_CAP = 0.5, 9.0
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeFit(Generic[W]):
+    """A warp fitted to edges.
+
+    ``covariance`` (P, P) is of the warp's own parameters, the bias marginalised.  ``weight`` (E, M) is each
+    point's final weight, 0 where it was not used; ``offset_px`` (E, M) its distance from ``before``, the
+    warp the edges were looked for with, the bias removed.  ``cost`` is the mean truncated squared residual
+    over every point in view: what alternatives are compared by.
+    """
+
+    warp: W
+    before: W
+    points: EdgePoints
+    weight: Array
+    offset_px: Array
+    sigma_px: float
+    covariance: Array
+    cost: float
+
+
+def fit_edges(light: NDArray[np.float32], warp: W, edges: NDArray[np.int64], search_px: float) -> EdgeFit[W] | None:
+    """Return ``warp`` moved by one Gauss-Newton step onto the edges seen near it; None when too few are seen."""
+    seen = locate(light, warp, edges, search_px)
+    use = _usable(seen)
+    if len({EDGES[e].side for e in seen.edge[use.any(axis=1)]}) < 4:
+        return None
+    template = EDGE_POINTS[seen.edge][use]
+    by_warp = np.einsum("nk,nkp->np", seen.normal[use], warp.jacobian(template))
+    A = np.column_stack([by_warp, np.ones(len(by_warp))])
+    share = np.broadcast_to(_independent_share(seen)[:, None], use.shape)[use]
+    delta, weight, sigma_px, covariance = _robust_least_squares(
+        A, seen.offset_px[use], share, np.append(warp.step_sigma(), BIAS_SIGMA_PX)
+    )
+    residual = seen.offset_px[use] - A @ delta
+    weights, offsets = np.zeros(use.shape), np.zeros(use.shape)
+    weights[use], offsets[use] = weight, seen.offset_px[use] - delta[-1]
+    in_view = max(int((seen.in_view & (seen.reach_px >= SHARP_REACH_PX)[:, None]).sum()), len(residual))
+    truncated = np.minimum((residual / COST_UNIT_PX) ** 2, COST_CAP).sum() + COST_CAP * (in_view - len(residual))
+    return EdgeFit(
+        warp.stepped(delta[:-1]), warp, seen, weights, offsets, sigma_px, covariance[:-1, :-1], truncated / in_view
+    )
+
+
+def _usable(seen: EdgePoints) -> NDArray[np.bool_]:
+    """Return which points (E, M) to use: those of edges mostly found and not too near their neighbours."""
+    mostly = seen.found.mean(axis=1) >= LEAST_FOUND * np.maximum(seen.in_view.mean(axis=1), 0.15)
+    return seen.found & (mostly & (seen.reach_px >= LEAST_REACH_PX))[:, None]
+
+
+def _independent_share(seen: EdgePoints) -> Array:
+    """Return how much (E,) one point of an edge counts.
+
+    Points denser than the noise's own length share it; an edge that its neighbours pull counts little.
+    """
+    spacing = seen.length_px / POINTS_PER_EDGE
+    sharpness = np.minimum(1.0, seen.reach_px / SHARP_REACH_PX) ** 4
+    return np.minimum(1.0, spacing / CORRELATION_LENGTH_PX) * sharpness
+
+
+def _robust_least_squares(
+    A: Array, offset: Array, share: Array, prior_sigma: Array
+) -> tuple[Array, Array, float, Array]:
+    """Solve A x = offset with Tukey's weights, each unknown known to be 0 within ``prior_sigma`` (P,) beforehand.
+
+    Returns x, the weights, the standard deviation of one point, and the covariance of x.
+    """
+    robust = np.ones(len(offset))
+    prior = prior_sigma**-2.0
+    scale = np.linalg.norm(A, axis=0) + 1e-12  # metres and radians differ by orders: solve in units of pixels
+    sigma_px = max(_spread(offset - np.median(offset)), 0.3)
+    for _ in range(REWEIGHTINGS):
+        weighted = (A / scale) * (robust * share / sigma_px**2)[:, None]
+        information = (A / scale).T @ weighted + np.diag(prior / scale**2 + 1e-9)
+        x = np.linalg.solve(information, weighted.T @ offset) / scale
+        residual = offset - A @ x
+        sigma_px = max(_spread(residual), NOISE_FLOOR_PX)
+        robust = np.clip(1 - (residual / (TUKEY * sigma_px)) ** 2, 0, None) ** 2
+    covariance = np.linalg.inv(information) / np.outer(scale, scale)
+    return x, robust * share, sigma_px, covariance
+
+
+def _spread(residual: Array) -> float:
+    """Return the robust standard deviation: 1.4826 times the median absolute residual."""
+    return float(1.4826 * np.median(np.abs(residual)))
+
+
+def measure_layers(fit: EdgeFit[W], shape: tuple[int, int]) -> tuple[LayerDetection, ...]:
+    """Return the layers whose black square was measured: all four edges located, wholly in an image of ``shape``.
+
+    Each edge is its predicted curve moved by an offset and a tilt of its own; corners are where neighbours meet.
+    """
+    layers = []
+    for layer in LAYERS:
+        rows = [i for i, e in enumerate(fit.points.edge) if EDGES[e].layer == layer.index and not EDGES[e].frame]
+        if len(rows) == 4 and (fit.weight[rows] > 0).sum(axis=1).min() >= LEAST_FOUND * POINTS_PER_EDGE:
+            corners, sigma_px = _layer_corners(fit, layer.black, rows)
+            height, width = shape
+            if (corners >= 0).all() and (corners <= (width - 1, height - 1)).all():
+                layers.append(LayerDetection(layer.index, corners, sigma_px))
+    return tuple(layers)
+
+
+def _layer_corners(fit: EdgeFit[W], black: tuple[float, float], rows: list[int]) -> tuple[Array, float]:
+    """Return the corners (4, 2) of a square whose edges are ``rows`` of the fit, and their standard deviation."""
+    template = square(*black)
+    predicted = fit.before(template)
+    ahead = np.roll(template, -1, axis=0) - template
+    tangent_out = fit.before(template + 0.02 * ahead) - predicted  # of the edge that starts at each corner
+    tangent_in = predicted - fit.before(template - 0.02 * np.roll(ahead, 1, axis=0))  # of the one that ends there
+    lines = [_edge_line(fit.offset_px[row], fit.weight[row], fit.sigma_px) for row in rows]
+    corners, variance = np.empty((4, 2)), np.empty(4)
+    for c in range(4):
+        ends, starts = lines[c - 1], lines[c]
+        N = np.array([_outward(tangent_in[c]), _outward(tangent_out[c])])
+        solve = np.linalg.inv(N)
+        corners[c] = predicted[c] + solve @ (ends[0][1], starts[0][0])
+        variance[c] = (solve**2 @ (ends[1][1], starts[1][0])).mean()
+    return corners, float(np.sqrt(variance.mean() + CORNER_FLOOR_PX**2))
+
+
+def _outward(tangent: Array) -> Array:
+    """Return the unit normal to the left of a clockwise tangent, out of the square."""
+    return np.array([tangent[1], -tangent[0]]) / np.linalg.norm(tangent)
+
+
+def _edge_line(offset: Array, weight: Array, sigma_px: float) -> tuple[Array, Array]:
+    """Return the offset of a line fitted along an edge at its start and end (2,), and their variances (2,)."""
+    basis = np.stack([1 - ALONG, ALONG], axis=1)
+    covariance = np.linalg.inv(basis.T @ (weight[:, None] * basis))
+    return covariance @ (basis.T @ (weight * offset)), sigma_px**2 * np.diag(covariance)

@@ -1,0 +1,118 @@
+"""Pose from the corners of layers: both planar solutions, refined on the marker's declared surface, with covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from astratag.camera import Camera
+from astratag.detection import LayerDetection, PlanarPose
+from astratag.geometry import LAYERS, print_from_template, square
+from astratag.surface import Surface
+from astratag.transforms import pose
+from astratag.warp import PoseWarp
+
+Array = NDArray[np.float64]
+
+MAX_STEPS = 30
+CONVERGED_PX2 = 1e-9
+"""Stop when the squared error, in sigmas, no longer falls by this fraction."""
+
+
+@dataclass(frozen=True, eq=False)
+class CornerPose:
+    """A pose refined on corners: ``covariance`` (6, 6) metres then radians, right perturbation in marker axes."""
+
+    T_cam_marker: Array
+    covariance: Array
+    reprojection_rms_px: float
+
+
+def poses_from_square(
+    camera: Camera, template: Array, corners_px: Array, side_m: float, surface: Surface
+) -> list[Array]:
+    """Return the one or two poses T_cam_marker that explain four corners as a plane, the likelier first.
+
+    ``template`` (4, 2) units of a square of the print, ``corners_px`` (4, 2) where it is seen.  On a curved
+    surface the plane is the one through its corners.
+    Collins and Bartoli, "Infinitesimal plane-based pose estimation", IJCV 2014.
+    """
+    points_marker = surface.points(print_from_template(template, side_m))
+    behind_m = points_marker[:, 2].mean()
+    in_plane = points_marker * (1.0, 1.0, 0.0)
+    rays = camera.undistort(corners_px)
+    if not np.isfinite(rays).all():
+        return []
+    try:
+        _, rotations, translations, _ = cv2.solvePnPGeneric(
+            in_plane, rays.reshape(-1, 1, 2), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+        )
+    except cv2.error:  # corners almost on one line
+        return []
+    poses = []
+    for rotation, translation in zip(rotations, translations, strict=True):
+        R_cam_marker = cv2.Rodrigues(rotation)[0]
+        t_cam_marker_m = translation.ravel() - R_cam_marker[:, 2] * behind_m
+        if np.isfinite(R_cam_marker).all() and np.isfinite(t_cam_marker_m).all() and t_cam_marker_m[2] > 0:
+            poses.append(pose(R_cam_marker, t_cam_marker_m))
+    return poses
+
+
+def planar_poses(
+    camera: Camera, layers: Sequence[LayerDetection], side_m: float, surface: Surface
+) -> tuple[CornerPose, ...]:
+    """Return both poses that explain the measured layers, each refined on all their corners, the better first."""
+    if not layers:
+        return ()
+    largest = min(layers, key=lambda seen: seen.layer)
+    starts = poses_from_square(camera, square(*LAYERS[largest.layer].black), largest.corners_px, side_m, surface)
+    refined = [refine_on_corners(PoseWarp(camera, side_m, surface, start), layers) for start in starts]
+    return tuple(sorted((r for r in refined if r is not None), key=lambda r: r.reprojection_rms_px))
+
+
+def as_planar(poses: Sequence[CornerPose]) -> tuple[PlanarPose, ...]:
+    """Return what a detection keeps of both poses."""
+    return tuple(PlanarPose(p.T_cam_marker, p.reprojection_rms_px) for p in poses)
+
+
+def refine_on_corners(start: PoseWarp, layers: Sequence[LayerDetection]) -> CornerPose | None:
+    """Return the pose that fits all corners of all layers best, weighted by their sigmas, from a start nearby.
+
+    Levenberg-Marquardt over the corners as they lie on the marker's surface.  The covariance follows from the
+    corners' sigmas, enlarged when the corners do not fit as well as these promise.  None when it ends behind
+    the camera.
+    """
+    template = np.concatenate([square(*LAYERS[seen.layer].black) for seen in layers])
+    corners_px = np.concatenate([seen.corners_px for seen in layers])
+    sigma_px = np.repeat([seen.sigma_px for seen in layers], 8)
+    warp, damping = start, 1e-3
+
+    def error(candidate: PoseWarp) -> Array:
+        return (corners_px - candidate(template)).ravel() / sigma_px
+
+    residual = error(warp)
+    for _ in range(MAX_STEPS):
+        J = warp.jacobian(template).reshape(-1, 6) / sigma_px[:, None]
+        information = J.T @ J
+        delta = np.linalg.solve(information + damping * np.diag(np.diag(information)), J.T @ residual)
+        moved = warp.stepped(delta)
+        after = error(moved)
+        gain = residual @ residual - after @ after
+        if gain <= 0:
+            damping *= 10
+            if damping > 1e6:
+                break
+            continue
+        warp, residual, damping = moved, after, damping / 10
+        if gain <= CONVERGED_PX2 * (1 + after @ after):
+            break
+    if warp.T_cam_marker[2, 3] <= 0:
+        return None
+    misfit = max(1.0, residual @ residual / max(len(residual) - 6, 1))
+    J = warp.jacobian(template).reshape(-1, 6) / sigma_px[:, None]
+    reprojection_rms_px = float(np.sqrt(((residual * sigma_px) ** 2).reshape(-1, 2).sum(axis=1).mean()))
+    return CornerPose(warp.T_cam_marker, misfit * np.linalg.inv(J.T @ J), reprojection_rms_px)

@@ -1,0 +1,201 @@
+"""Signatures: from a warp of the template into the image to an identity, an orientation and how sure it is.
+
+A *warp* takes template points (700 units to the side, y down) to pixels.  The 48 cells are sampled in the
+gray image through it, a smooth illumination surface fitted to points that are black in every identity is
+removed, and what is left is correlated with every code in every orientation: soft bits, no threshold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from astratag.dictionary import Dictionary
+from astratag.geometry import CELLS, DRAWN_OFFSET, LAYERS, QUIET_MARGIN, TEMPLATE_UNITS, cell_polygons, layer_points
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Warp = Callable[[Array], Array]
+"""Takes template points (..., 2) to pixels (..., 2)."""
+
+ACCEPT = 0.72
+"""Cells-only correlation of chance patterns exceeds this once in a million candidates."""
+ACCEPT_OF_MANY_WARPS = 0.78
+"""The same when a candidate is read through several warps and the best counts."""
+
+
+def _cell_samples() -> Array:
+    """Return the sampling points (48, 10, 2) of the cells: a triangular grid, kept off the cells' edges."""
+    grid = [(i, j, 3 - i - j) for i in range(4) for j in range(4 - i)]
+    weights = 1 / 3 + 0.62 * (np.array(grid) / 3 - 1 / 3)
+    return np.einsum("sv,cvd->csd", weights, cell_polygons() + DRAWN_OFFSET)
+
+
+def _always_black() -> Array:
+    """Return points (B, 2) that are black in every identity: the border, and the gaps between the regions."""
+    along = np.linspace(0.03, 0.97, 16) * TEMPLATE_UNITS
+    low, high = np.full(16, 0.034 * TEMPLATE_UNITS), np.full(16, 0.966 * TEMPLATE_UNITS)
+    border = np.concatenate([np.stack(p, axis=1) for p in ((along, low), (along, high), (low, along), (high, along))])
+    step = np.linspace(0.0, 1.0, 6)[:, None]
+    gap = np.array([60.0, 290.0]) + step * np.array([100.0, -100.0])  # between the top-left and the left region
+    gaps = [gap]
+    for flip in (lambda p: p[:, ::-1], lambda p: p * (-1, 1) + (700, 0), lambda p: p * (1, -1) + (0, 700)):
+        gaps += [flip(g) for g in gaps]
+    return np.concatenate([border, *gaps])
+
+
+def _smooth(points: Array) -> Array:
+    """Return the terms (N, 6) of a quadratic surface at template points (N, 2)."""
+    x, y = (points / (TEMPLATE_UNITS / 2) - 1.0).T
+    return np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=1)
+
+
+CELL_SAMPLES = _cell_samples()
+ALWAYS_BLACK = _always_black()
+SAMPLES = np.concatenate([CELL_SAMPLES.reshape(-1, 2), ALWAYS_BLACK])
+_ILLUMINATION = _smooth(CELL_SAMPLES.mean(axis=1)) @ np.linalg.pinv(_smooth(ALWAYS_BLACK))
+"""Takes the always-black samples (B,) to the black level at the cells (48,)."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """The best explanation of one pattern: which code, turned clockwise by how many quarters, how well."""
+
+    marker_id: int
+    quarter_turns: int
+    correlation: float
+    hamming: int
+
+
+class Codebook:
+    """A dictionary ready for correlation."""
+
+    def __init__(self, dictionary: Dictionary) -> None:
+        self.dictionary = dictionary
+        codes = dictionary.oriented.reshape(-1, CELLS).astype(float)
+        codes -= codes.mean(axis=1, keepdims=True)
+        self._unit_codes = codes / np.linalg.norm(codes, axis=1, keepdims=True)
+
+    def read(self, cells: Array) -> list[Reading]:
+        """Return the best reading of each row of cells (Q, 48)."""
+        if len(cells) == 0:
+            return []
+        correlations = unit(cells) @ self._unit_codes.T
+        best = correlations.argmax(axis=1)
+        ids, bits = self.dictionary.ids, self.dictionary.oriented.reshape(-1, CELLS)
+        return [
+            Reading(ids[b // 4], int(b % 4), float(correlations[q, b]), hamming(cells[q], bits[b]))
+            for q, b in enumerate(best)
+        ]
+
+    def read_as(self, cells: Array, marker_id: int) -> Reading:
+        """Return how well cells (48,) fit an upright marker of a known identity."""
+        row = self.dictionary.ids.index(marker_id)
+        correlation = float(unit(cells[None])[0] @ self._unit_codes[4 * row])
+        return Reading(marker_id, 0, correlation, hamming(cells, self.dictionary.signatures[row]))
+
+
+def unit(cells: Array) -> Array:
+    """Return rows (Q, N) with zero mean and unit length; a row without contrast becomes zero."""
+    centred = cells - cells.mean(axis=1, keepdims=True)
+    length = np.linalg.norm(centred, axis=1, keepdims=True)
+    return centred / np.where(length > 1e-9, length, np.inf)
+
+
+def hamming(cells: Array, code: NDArray[np.uint8]) -> int:
+    """Return how many cells (48,) fall on the wrong side of the level half way between black and white."""
+    middle = (cells[code == 1].mean() + cells[code == 0].mean()) / 2
+    return int(((cells > middle) != (code == 1)).sum())
+
+
+def sample(gray: Image, points_px: Array) -> Array:
+    """Return gray values at pixels (N, M, 2), interpolated; 0 outside the image."""
+    points = np.clip(points_px, -1e4, 1e4).astype(np.float32)
+    flat = points.reshape(-1, 1, 2)
+    if len(flat) < 32_000:
+        return cv2.remap(gray, flat, None, cv2.INTER_LINEAR).reshape(points.shape[:-1]).astype(float)
+    return cv2.remap(gray, points, None, cv2.INTER_LINEAR).astype(float)
+
+
+def cell_values(gray: Image, samples_px: Array) -> Array:
+    """Return the 48 cell means (Q, 48), black level removed, of patterns sampled at ``SAMPLES`` (Q, S, 2)."""
+    values = sample(gray, samples_px)
+    cells = values[:, : CELL_SAMPLES.shape[0] * CELL_SAMPLES.shape[1]].reshape(len(values), CELLS, -1).mean(axis=2)
+    return cells - values[:, -len(ALWAYS_BLACK) :] @ _ILLUMINATION.T
+
+
+def layer_cells(gray: Image, warp: Warp, layer: int) -> Array:
+    """Return the cells (48,) of one layer of a marker whose print is warped into the image."""
+    return cell_values(gray, warp(layer_points(SAMPLES, LAYERS[layer]))[None])[0]
+
+
+class Artwork:
+    """What the whole print looks like around a square read in it, for each layer that square may be."""
+
+    GRID = 32
+    REACH = 0.12
+    """How far beyond the square to look, as a fraction of its side: less than the quiet margin."""
+    UNITS_PER_PIXEL = 0.5
+
+    def __init__(self, dictionary: Dictionary) -> None:
+        self._dictionary = dictionary
+        self._expected: dict[int, Array] = {}
+        span = np.linspace(-self.REACH, 1 + self.REACH, self.GRID) * TEMPLATE_UNITS
+        self.points = np.stack(np.meshgrid(span, span), axis=-1).reshape(-1, 2)
+        """Where to sample (N, 2), as if the square were the outermost."""
+
+    def expected(self, marker_id: int) -> Array:
+        """Return the print's brightness (3, N) at ``points`` for each layer the square may be."""
+        if marker_id not in self._expected:
+            picture = self._picture(self._dictionary.signature(marker_id))
+            sampled = []
+            for layer in LAYERS:
+                spacing = layer.scale * TEMPLATE_UNITS * (1 + 2 * self.REACH) / (self.GRID - 1) / self.UNITS_PER_PIXEL
+                blurred = cv2.blur(picture, (max(1, round(spacing)),) * 2)
+                at = (layer_points(self.points, layer) + QUIET_MARGIN * TEMPLATE_UNITS) / self.UNITS_PER_PIXEL - 0.5
+                sampled.append(sample(blurred, at[None])[0])
+            self._expected[marker_id] = np.array(sampled)
+        return self._expected[marker_id]
+
+    def _picture(self, code: NDArray[np.uint8]) -> Image:
+        """Return the print with its margin, half a unit to the pixel."""
+        margin = QUIET_MARGIN * TEMPLATE_UNITS
+        size = round((TEMPLATE_UNITS + 2 * margin) / self.UNITS_PER_PIXEL)
+        picture = np.full((size, size), 255, np.uint8)
+
+        def fill(polygon: Array, value: int) -> None:
+            at = (polygon + margin) / self.UNITS_PER_PIXEL - 0.5
+            cv2.fillPoly(picture, [np.round(at * 16).astype(np.int32)], value, shift=4)
+
+        def box(near: float, far: float) -> Array:
+            return np.array([(near, near), (far, near), (far, far), (near, far)])
+
+        for layer in LAYERS:
+            if layer.frame is not None:
+                fill(box(*layer.frame), 255)
+            fill(box(*layer.black), 0)
+            for cell in cell_polygons()[code == 1] + DRAWN_OFFSET:
+                fill(layer_points(cell, layer), 255)
+        return picture
+
+    def likeness(self, gray: Image, warp: Warp, marker_id: int) -> float:
+        """Return the correlation of a whole print with the image seen through its warp."""
+        return float(self.layer_scores(gray, warp, marker_id)[0])
+
+    def layer_scores(self, gray: Image, square_warp: Warp, marker_id: int) -> Array:
+        """Return how well (3,) the surroundings of a square fit it being layer 0, 1 or 2, as correlations.
+
+        ``square_warp`` takes the template to the image as if the square were the outermost.
+        Points outside the image do not count.
+        """
+        at = square_warp(self.points)
+        height, width = gray.shape
+        inside = (at >= 0).all(axis=1) & (at[:, 0] <= width - 1) & (at[:, 1] <= height - 1)
+        if inside.sum() < 16:
+            return np.zeros(len(LAYERS))
+        seen = unit(sample(gray, at[None, inside]))[0]
+        return unit(self.expected(marker_id)[:, inside]) @ seen
