@@ -1,0 +1,75 @@
+"""What every source of frames is: its envelopes in order, and what is known about its camera."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from numpy.typing import NDArray
+
+from astratag.camera import Camera
+from pipeline.mission import Mission
+from pipeline.opencv_log import quiet_opencv
+from schemas import Envelope, Stamp, Topic
+
+
+class SourceError(ValueError):
+    """A source that cannot be opened, in one line."""
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """What the user says about a source that the source itself may not know."""
+
+    camera: Path | None = None
+    """Calibration file; wins over a recorded calibration."""
+    mission: Path | None = None
+    """Mission file; wins over a recorded mission."""
+    fps: float | None = None
+    """Of a folder or a video; asked of a camera."""
+    scale_camera: bool = False
+    """The picture was only resized: scale a calibration of another size instead of refusing it."""
+
+
+class Source(ABC):
+    """Frames in order, with what is known about their camera.
+
+    ``frame_count`` is None when live.  While ``envelopes`` is drawn, which is done once, ``skipped`` counts images that cannot be used,
+    ``backwards`` frames captured before their predecessor, and ``warnings`` may grow.
+    """
+
+    live = False
+
+    def __init__(self, mission: Mission, calibration: CameraCalibration, frame_count: int | None):
+        self.mission = mission
+        self.calibration = calibration
+        self.frame_count = frame_count
+        self.warnings: list[str] = []
+        self.skipped = 0
+        self.backwards = 0
+
+    @abstractmethod
+    def envelopes(self) -> Iterator[Envelope]:
+        """Yield the calibration, then frames, each after its truth; ``t_origin_ns`` is 0."""
+
+    def _envelope(self, topic: Topic, payload: bytes, stamp: Stamp) -> Envelope:
+        key = topic.key(vehicle=self.mission.vehicle, camera=self.mission.camera.name)
+        return Envelope(topic, key, payload, stamp)
+
+
+def load_camera(options: SourceOptions, width: int, height: int) -> Camera | None:
+    """Return the camera of the given file for images of this size, None when no file is given."""
+    if options.camera is None:
+        return None
+    return Camera.load(options.camera, width=width, height=height, scale=options.scale_camera)
+
+
+def decoded(data: bytes) -> NDArray[np.uint8] | None:
+    """Return the image (height, width, 3) in encoded bytes, None when there is none."""
+    with quiet_opencv():
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
