@@ -34,6 +34,9 @@ Array = NDArray[np.float64]
 
 CORNER_DOF = 8
 """Image coordinates of the four corners of one black square."""
+NEXT_CORNER, PREVIOUS_CORNER = [1, 2, 3, 0], [3, 0, 1, 2]
+SHARPEST = 0.1
+"""One plus the cosine between neighbouring edges' normals, bounded so that a needle's corner stays near."""
 NEAREST_M = 1e-3
 """A corner nearer to the camera than this, or behind it, is not a measurement that can be linearised."""
 MOST_ITERATIONS = 20
@@ -111,13 +114,17 @@ class CornerFilter:
 
     def gate(self, layers: Sequence[SeenLayer], eye: Eye) -> Array:
         """Return the normalised innovation squared of each layer by itself, infinite where it cannot be seen."""
-        distances = np.full(len(layers), np.inf)
+        seen = predicted_corners(self.motion, layers, eye)
+        if seen is None and len(layers) > 1:
+            return np.concatenate([self.gate([layer], eye) for layer in layers])
+        if seen is None:
+            return np.array([np.inf])
+        distances = np.empty(len(layers))
         for k, layer in enumerate(layers):
-            seen = predicted_corners(self.motion, [layer], eye)
-            if seen is not None:
-                residual = layer.corners_px.ravel() - seen[0]
-                S = seen[1] @ self.covariance @ seen[1].T + layer.sigma_px**2 * np.eye(CORNER_DOF)
-                distances[k] = residual @ np.linalg.solve(S, residual)
+            rows = slice(CORNER_DOF * k, CORNER_DOF * (k + 1))
+            residual, H = layer.corners_px.ravel() - seen[0][rows], seen[1][rows]
+            S = H @ self.covariance @ H.T + layer.sigma_px**2 * np.eye(CORNER_DOF)
+            distances[k] = residual @ np.linalg.solve(S, residual)
         return distances
 
     def update(self, layers: Sequence[SeenLayer], eye: Eye) -> Update | None:
@@ -219,13 +226,12 @@ def outward_shift(quads_px: Array) -> Array:
 
     A corner moves by d with d.n = 1 for the outward normals n of both its edges.
     """
-    edges = np.roll(quads_px, -1, axis=1) - quads_px
-    lengths = np.maximum(np.linalg.norm(edges, axis=2, keepdims=True), np.finfo(float).tiny)
-    x, y = np.moveaxis(edges, 2, 0)
-    turn = np.sign(np.sum(x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1), axis=1))
-    normals = turn[:, None, None] * np.stack([y, -x], axis=-1) / lengths
-    before = np.roll(normals, 1, axis=1)
-    return (before + normals) / np.maximum(1 + np.sum(before * normals, axis=2, keepdims=True), 0.1)
+    edges = quads_px[:, NEXT_CORNER] - quads_px
+    x, y = edges[..., 0], edges[..., 1]
+    turn = np.sign(np.sum(x * y[:, NEXT_CORNER] - y * x[:, NEXT_CORNER], axis=1))
+    normals = np.stack([y, -x], axis=-1) * (turn[:, None] / np.maximum(np.hypot(x, y), np.finfo(float).tiny))[..., None]
+    before = normals[:, PREVIOUS_CORNER]
+    return (before + normals) / np.maximum(1 + np.sum(before * normals, axis=2, keepdims=True), SHARPEST)
 
 
 def gate_limit(probability: float, dof: int) -> float:

@@ -1,31 +1,28 @@
 """A simulated approach for the filter's tests and benchmark: exact motion, and corners as a detector would send them.
 
-The chaser closes in along the target port's axis while both sway and the target tumbles by a few degrees; there are no
-pictures, corners come from ``Camera.project`` with Gaussian noise.
+The motion is ``pipeline.scenario``'s; there are no pictures, corners come from ``Camera.project`` with Gaussian noise.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from astratag.camera import Camera
-from astratag.transforms import exp_so3, inverse, log_so3, pose, transform
+from astratag.geometry import LAYERS
+from astratag.transforms import inverse, transform
 from pipeline.convert import calibration_message, points_message, pose_message
+from pipeline.corner_filter import outward_shift
 from pipeline.mission import CameraSection, CylinderSection, FlatSection, MarkerSection, Mission, PoseSection
 from pipeline.pose_filter import corners_on_target
+from pipeline.scenario import Approach, RelativeMotion
 from schemas import Detection, Detections, LayerCorners, PlanarPose
 
 Array = NDArray[np.float64]
 
 CAMERA = Camera([[1000.0, 0, 639.5], [0, 1000.0, 359.5], [0, 0, 1]], width=1280, height=720)
 T0_NS = 1_750_000_000_000_000_000
-FACING = np.diag([1.0, -1.0, -1.0])
-"""A marker square-on to the camera, upright in the image."""
 SMALLEST_SIDE_PX = 12.0
-LAYERS_BY_RANGE = (0, 1, 2)
 
 CYLINDER = CylinderSection(radius_m=0.15, axis_rad=float(np.pi / 2))
 MARKER = 19
@@ -42,53 +39,24 @@ def mission(surface: FlatSection | CylinderSection = CYLINDER, side_m: float = 0
     )
 
 
-@dataclass(frozen=True)
-class Approach:
-    """The marker's true motion in the camera, smooth in time."""
-
-    start_m: float = 1.5
-    end_m: float = 0.06
-    duration_s: float = 30.0
-    tilt_rad: float = float(np.deg2rad(3.0))
-    tilt_rate_rad_s: float = 0.6
-    sway_share: float = 0.04
-    """Lateral sway, as a share of the range."""
-    seed: int = 0
-    phases: Array = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        phases = np.random.default_rng(self.seed).uniform(0, 2 * np.pi, 6)
-        object.__setattr__(self, "phases", phases)
-
-    def T_cam_marker(self, t_s: float) -> Array:  # noqa: N802
-        """Return the pose of the marker in the camera at a time."""
-        share = 0.5 - 0.5 * np.cos(np.pi * np.clip(t_s / self.duration_s, 0, 1))
-        range_m = self.start_m + (self.end_m - self.start_m) * share
-        rate = self.tilt_rate_rad_s
-        sway = self.sway_share * range_m * np.sin(0.5 * rate * t_s + self.phases[:2])
-        tilt = self.tilt_rad * np.sin(rate * np.array([1.0, 0.8, 0.6]) * t_s + self.phases[3:])
-        return pose(FACING @ exp_so3(tilt), [*sway, range_m])
+def approach(seed: int, **kwargs: object) -> Approach:
+    """Return an approach whose sway and tumble begin anywhere in their periods."""
+    phases = np.random.default_rng(seed).uniform(0, 2 * np.pi, 5).tolist()
+    return Approach(sway_phase_rad=tuple(phases[:2]), tumble_phase_rad=tuple(phases[2:]), **kwargs)
 
 
-def truth(mission_: Mission, approach: Approach, t_s: float) -> tuple[Array, Array, Array]:
-    """Return T_chaser_target, its velocity and its rate, by central differences exact to 1e-9."""
-    T_chaser_cam = mission_.camera.T_chaser_cam.matrix()
-    T_marker_target = inverse(mission_.markers[0].T_target_marker.matrix())
-
-    def at(t: float) -> Array:
-        return T_chaser_cam @ approach.T_cam_marker(t) @ T_marker_target
-
-    h = 1e-4
-    before, after = at(t_s - h), at(t_s + h)
-    v = (after[:3, 3] - before[:3, 3]) / (2 * h)
-    return at(t_s), v, log_so3(before[:3, :3].T @ after[:3, :3]) / (2 * h)
+def truth(mission_: Mission, marker_motion: RelativeMotion) -> RelativeMotion:
+    """Return the target's motion past the chaser for a marker's motion past the camera."""
+    return marker_motion.mounted(
+        mission_.camera.T_chaser_cam.matrix(), inverse(mission_.markers[0].T_target_marker.matrix())
+    )
 
 
 def visible_layers(mission_: Mission, T_chaser_target: Array) -> dict[int, Array]:
     """Return the true corners (4, 2) of each layer that is wholly in the image and large enough to be read."""
     T_cam_target = inverse(mission_.camera.T_chaser_cam.matrix()) @ T_chaser_target
     seen = {}
-    for layer in LAYERS_BY_RANGE:
+    for layer in range(len(LAYERS)):
         corners = CAMERA.project(transform(T_cam_target, corners_on_target(mission_.markers[0], layer)))
         inside = (corners > 3).all() and (corners < (CAMERA.width - 4, CAMERA.height - 4)).all()
         if inside and np.ptp(corners, axis=0).min() > SMALLEST_SIDE_PX:
@@ -108,8 +76,6 @@ def detection(
 
     Its pose is the true one, as a refined pose would be to a few sigma.
     """
-    from pipeline.corner_filter import outward_shift
-
     layers = visible_layers(mission_, T_chaser_target)
     if not layers:
         return None
