@@ -58,7 +58,7 @@ class PictureSource(Source):
         calibration = calibration_message(camera, frame_id=mission.camera.name, t_capture_ns=t_start_ns)
         super().__init__(mission, calibration, frame_count)
         if assumed:
-            self.warnings.append(
+            self._warn(
                 "no camera calibration given: a lens of 60 degrees is assumed, so ranges are not to scale"
             )
 
@@ -99,7 +99,7 @@ class FolderSource(PictureSource):
                 yield picture
             else:
                 self.skipped += 1
-                self.warnings.append(f"skipped {path}: it {picture}")
+                self._warn(f"skipped {path}: it {picture}")
 
 
 def _read(path: Path, t_capture_ns: int) -> Picture | str:
@@ -139,7 +139,7 @@ class VideoSource(PictureSource):
                     break
                 yield encoded_picture(image, EPOCH_NS + round(k * self._period_s * NS_PER_S))
         if self.frame_count is not None and k < self.frame_count:
-            self.warnings.append(f"{self._path} has {k} readable frames, its header says {self.frame_count}")
+            self._warn(f"{self._path} has {k} readable frames, its header says {self.frame_count}")
 
     @contextmanager
     def _opened(self) -> Iterator[cv2.VideoCapture]:

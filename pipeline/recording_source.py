@@ -41,7 +41,7 @@ class RecordingSource(Source):
         calibration = decode(CameraCalibration, self._first_calibration)
         super().__init__(mission, calibration, self._recording.topics()[self._frame_key])
         if options.fps is not None:
-            self.warnings.append("a frame rate was given: recorded frames keep their own time stamps")
+            self._warn("a frame rate was given: recorded frames keep their own time stamps")
 
     def envelopes(self) -> Iterator[Envelope]:
         """Yield the calibration and, when it changes, later ones; every frame after the truth up to its capture."""
@@ -64,7 +64,7 @@ class RecordingSource(Source):
                 if calibration != before:
                     yield self._envelope(CALIBRATION, calibration, stamp)
         if self.backwards:
-            self.warnings.append(f"{self.backwards} frames were captured before their predecessor")
+            self._warn(f"{self.backwards} frames were captured before their predecessor")
 
     def _truths(self) -> deque[Envelope]:
         """Return the recorded truth of the frames' vehicle in the order of its time."""

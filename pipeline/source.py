@@ -39,7 +39,7 @@ class SourceOptions:
 class Source(ABC):
     """Frames in order, with what is known about their camera.
 
-    ``frame_count`` is None when live.  While ``envelopes`` is drawn, which is done once, ``skipped`` counts images that cannot be used,
+    ``frame_count`` is None when live.  While ``envelopes`` is drawn, ``skipped`` counts images that cannot be used,
     ``backwards`` frames captured before their predecessor, and ``warnings`` may grow.
     """
 
@@ -56,6 +56,10 @@ class Source(ABC):
     @abstractmethod
     def envelopes(self) -> Iterator[Envelope]:
         """Yield the calibration, then frames, each after its truth; ``t_origin_ns`` is 0."""
+
+    def _warn(self, line: str) -> None:
+        if line not in self.warnings:
+            self.warnings.append(line)
 
     def _envelope(self, topic: Topic, payload: bytes, stamp: Stamp) -> Envelope:
         key = topic.key(vehicle=self.mission.vehicle, camera=self.mission.camera.name)
