@@ -15,7 +15,7 @@ from astratag.transforms import exp_so3, inverse, perturb, pose, transform
 from pipeline.convert import calibration_message, points_message, pose_message, vector_message
 from pipeline.expected import visible_layers
 from pipeline.mission import MarkerSection, Mission
-from schemas import Detection, Detections, Envelope, LayerCorners, Mode, RelativeState, Stamp, Truth
+from schemas import Detection, Detections, Envelope, LayerCorners, Mode, PortToPort, RelativeState, Stamp, Truth
 from schemas.codec import AnyMessage
 
 Array = NDArray[np.float64]
@@ -131,4 +131,20 @@ def _state(
         nis_dof=8 * max(len(found), 1),
         marker_ids=[d.marker_id for d in found for _ in d.layers],
         layers=[seen.layer for d in found for seen in d.layers],
+        port=_port(T_hat, v_m_s),
+    )
+
+
+def _port(T_chaser_target: Array, v_m_s: Array) -> PortToPort:
+    range_m = float(np.linalg.norm(T_chaser_target[:3, 3]))
+    return PortToPort(
+        range_m=range_m,
+        axial_m=range_m,
+        lateral_m=0.0,
+        closing_speed_m_s=-float(v_m_s @ T_chaser_target[:3, 3]) / range_m,
+        lateral_speed_m_s=0.0,
+        misalignment_rad=0.0,
+        roll_rad=0.0,
+        corridor_angle_rad=0.0,
+        in_corridor=True,
     )
