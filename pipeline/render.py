@@ -26,7 +26,7 @@ from astratag.geometry import (
     layer_points,
 )
 from astratag.surface import Cylinder, Flat, Surface
-from astratag.transforms import inverse
+from astratag.transforms import inverse, transform
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -38,6 +38,9 @@ PRINT_UNITS = TEMPLATE_UNITS * (1 + 2 * QUIET_MARGIN)
 TEXELS_PER_UNIT = 4
 """Texels of the print to a template unit: at most a pixel each while a unit spans less than 4 px."""
 
+NEAR_PLANE_M = 1e-4
+"""Points nearer than this before the camera have no place in its picture."""
+
 
 class Texture:
     """A picture in linear light on a surface, with halved copies of itself so that it can be read area by area.
@@ -47,6 +50,7 @@ class Texture:
     """
 
     def __init__(self, picture: NDArray[np.float32] | NDArray[np.uint8], width_m: float):
+        self.width_m = width_m
         self._texels_per_m = picture.shape[1] / width_m
         self._levels = [picture]
         while min(self._levels[-1].shape[:2]) >= 8:
@@ -115,6 +119,11 @@ def _add_triangle(white: Image, centres: Array, corners: Array, texels_per_unit:
         covered *= np.clip(inside * texels_per_unit / widest + 0.5, 0, 1).astype(np.float32)
     patch = white[low[1] : high[1], low[0] : high[0]]
     np.minimum(patch + covered, 1.0, out=patch)
+
+
+def print_texture(signature: NDArray[np.uint8], side_m: float) -> Texture:
+    """Return ``print_coverage`` of a marker with black squares of ``side_m``, 0 for ink and 1 for white."""
+    return _print_texture(np.ascontiguousarray(signature, np.uint8).tobytes(), side_m)
 
 
 @lru_cache(maxsize=8)
@@ -211,10 +220,12 @@ def lay_print(
         raise ValueError(f"side_m must be a positive side in metres, got {side_m}")
     light = np.array(light, np.float32)
     half_m = side_m * PRINT_UNITS / TEMPLATE_UNITS / 2
-    window = _window(camera, T_cam_marker, surface, half_m)
+    grid = np.linspace(-half_m, half_m, 33)
+    enclosing = surface.points(np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2))
+    window = window_of(camera, transform(T_cam_marker, enclosing))
     if window is None:
         return light
-    texture = _print_texture(np.ascontiguousarray(signature, np.uint8).tobytes(), side_m)
+    texture = print_texture(signature, side_m)
     rays, right, down = (part[window] for part in pixel_rays(camera))
     behind = light[window].copy()
     total = np.zeros_like(behind)
@@ -267,21 +278,32 @@ def _hit_cylinder(surface: Cylinder, o: Array, dx: Array, dy: Array, dz: Array) 
     return depth, c * along - s * around, s * along + c * around, facing
 
 
-def _window(camera: Camera, T_cam_marker: Array, surface: Surface, half_m: float) -> tuple[slice, slice] | None:
-    """Return the rows and columns of pixels that a print can touch, None when it is out of sight."""
-    grid = np.linspace(-half_m, half_m, 33)
-    points = surface.points(np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2))
-    points_cam = points @ T_cam_marker[:3, :3].T + T_cam_marker[:3, 3]
-    in_front = points_cam[:, 2] > 1e-3 * half_m
+def window_of(camera: Camera, points_cam: Array) -> tuple[slice, slice] | None:
+    """Return the rows and columns of pixels that enclose points (N, 3) in the camera frame.
+
+    All of the picture when some of the points are beside or behind the camera; None when they are out of sight.
+    """
+    in_front = points_cam[:, 2] > NEAR_PLANE_M
     if not in_front.any():
         return None
-    if not in_front.all():
-        return slice(0, camera.height), slice(0, camera.width)
-    pixels = camera.project(points_cam)
-    low = np.floor(pixels.min(axis=0)).astype(int) - 3
-    high = np.ceil(pixels.max(axis=0)).astype(int) + 4
-    columns = slice(max(low[0], 0), min(high[0], camera.width))
-    rows = slice(max(low[1], 0), min(high[1], camera.height))
-    if columns.start >= columns.stop or rows.start >= rows.stop:
-        return None
-    return rows, columns
+    rows, columns = slice(0, camera.height), slice(0, camera.width)
+    if in_front.all():
+        spread = points_cam[:, :2] / points_cam[:, 2:]
+        # Bounds of rays, not of projected points: far outside the picture the distortion polynomial folds back.
+        low_x, high_x, low_y, high_y = _ray_bounds(camera)
+        columns = _between(low_x, high_x, *np.sort(spread[:, 0])[[0, -1]])
+        rows = _between(low_y, high_y, *np.sort(spread[:, 1])[[0, -1]])
+    return (rows, columns) if rows.stop > rows.start and columns.stop > columns.start else None
+
+
+@lru_cache(maxsize=4)
+def _ray_bounds(camera: Camera) -> tuple[Array, Array, Array, Array]:
+    """Return the least and the greatest x/z of each column, and y/z of each row."""
+    x, y = np.moveaxis(pixel_rays(camera)[0], -1, 0)
+    return x.min(axis=0), x.max(axis=0), y.min(axis=1), y.max(axis=1)
+
+
+def _between(low: Array, high: Array, first: float, last: float) -> slice:
+    """Return the lines of pixels between two values, with two lines to spare."""
+    met = np.flatnonzero((high >= first) & (low <= last))
+    return slice(max(met[0] - 2, 0), met[-1] + 3) if met.size else slice(0, 0)
