@@ -33,6 +33,9 @@ DEFAULT_PORT = 7447
 """Zenoh's own, where a live run can be joined."""
 _RETRY = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
 _ROUTER_PATIENCE_MS = 10_000
+# The library's own type stubs want arguments that it has no use for.
+_RECOVERY = ext.RecoveryConfig(heartbeat=True)  # type: ignore[call-arg]
+_MISS_DETECTION = ext.MissDetectionConfig(heartbeat=0.2)  # type: ignore[call-arg]
 
 
 class BusError(ValueError):
@@ -138,7 +141,6 @@ class Bus:
         self._session = _open(link)
         self._publishers: dict[str, Any] = {}
         self._kept: list[Any] = []  # subscribers and tokens live as long as something holds them
-        self._credit_key = self._node_key(node, "credit")
         self._last_latched: dict[str, tuple[Stamp, bytes]] = {}
 
     def publish(self, envelope: Envelope) -> None:
@@ -159,35 +161,33 @@ class Bus:
 
             if topic.latched:
                 history = ext.HistoryConfig(max_samples=1, detect_late_publishers=True)
-                recovery = ext.RecoveryConfig(heartbeat=True)
-                subscriber = ext.declare_advanced_subscriber(
-                    self._session, key, on_sample, history=history, recovery=recovery
+                self._kept.append(
+                    ext.declare_advanced_subscriber(self._session, key, on_sample, history=history, recovery=_RECOVERY)
                 )
             else:
-                subscriber = self._session.declare_subscriber(key, on_sample)
-            self._kept.append(subscriber)
+                self._kept.append(self._session.declare_subscriber(key, on_sample))
 
-    def watch(self, nodes: Iterable[str] | None = None, *, credits: bool = True) -> None:
+    def watch(self, nodes: Iterable[str] | None = None) -> None:
         """Have nodes' comings, goings and credits put in the mailbox; all nodes' by default."""
         for node in ["*"] if nodes is None else nodes:
             alive = self._node_key(node, "alive")
             self._kept.append(
                 self._session.liveliness().declare_subscriber(alive, self._receive_presence, history=True)
             )
-            if credits:
-                credit = self._node_key(node, "credit")
-                self._kept.append(self._session.declare_subscriber(credit, self._receive_credit))
+            credit = self._node_key(node, "credit")
+            self._kept.append(self._session.declare_subscriber(credit, self._receive_credit))
 
     def announce(self) -> None:
         """Tell the others that this node is ready: to be called when all subscriptions are made."""
         self._kept.append(self._session.liveliness().declare_token(self._node_key(self._node, "alive")))
 
     def send(self, credit: Credit) -> None:
-        """Tell the others what this node has dealt with."""
-        publisher = self._publishers.get(self._credit_key)
+        """Tell the others what a node has dealt with: this one, or one that can no longer speak for itself."""
+        key = self._node_key(credit.node, "credit")
+        publisher = self._publishers.get(key)
         if publisher is None:
-            publisher = self._publishers[self._credit_key] = self._session.declare_publisher(
-                self._credit_key, congestion_control=zenoh.CongestionControl.BLOCK, express=True
+            publisher = self._publishers[key] = self._session.declare_publisher(
+                key, congestion_control=zenoh.CongestionControl.BLOCK, express=True
             )
         publisher.put(json.dumps(asdict(credit)).encode())
 
@@ -206,7 +206,7 @@ class Bus:
 
     def _declare_publisher(self, topic: Topic, key: str) -> Any:
         may_drop = not self._lossless and not topic.latched
-        options = {
+        options: dict[str, Any] = {
             "encoding": zenoh.Encoding("application/protobuf").with_schema(schema_name(topic.schema)),
             "congestion_control": zenoh.CongestionControl.DROP if may_drop else zenoh.CongestionControl.BLOCK,
             "reliability": zenoh.Reliability.RELIABLE,
@@ -219,7 +219,7 @@ class Bus:
             key,
             cache=ext.CacheConfig(max_samples=1),
             publisher_detection=True,
-            sample_miss_detection=ext.MissDetectionConfig(heartbeat=0.2),
+            sample_miss_detection=_MISS_DETECTION,
             **options,
         )
 

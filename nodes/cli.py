@@ -1,0 +1,182 @@
+"""The command line: ``relnav``.
+
+Only argparse is imported here: each command imports what it needs, so that help and errors come at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+
+EXIT_ERROR, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
+DESCRIPTION = "Relative navigation for spacecraft rendezvous on AstraTag markers."
+EPILOG = """\
+Start with `relnav replay`: it flies the shipped approach and scores it.
+`relnav COMMAND --help` explains a command, with an example.
+RELNAV_DEBUG=1 shows where an error comes from.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command and return the exit code: 0 only when the job was done."""
+    args = _parser().parse_args(arguments)
+    module, function = args.run.split(":")
+    try:
+        code = getattr(import_module(module), function)(args)
+    except KeyboardInterrupt:
+        return _fail("interrupted", EXIT_INTERRUPTED)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader of our output left
+        return EXIT_ERROR
+    except Exception as error:
+        if os.environ.get("RELNAV_DEBUG"):
+            raise
+        text = " ".join(str(error).split()) or type(error).__name__
+        expected = isinstance(error, ValueError | OSError) or type(error).__name__ == "NodeError"
+        return _fail(text if expected else f"{type(error).__name__}: {text}; RELNAV_DEBUG=1 shows where", EXIT_ERROR)
+    return int(code or 0)
+
+
+def _fail(text: str, code: int) -> int:
+    print(f"relnav: error: {text}", file=sys.stderr, flush=True)
+    return code
+
+
+class _Parser(argparse.ArgumentParser):
+    """Errors in one line, like all our errors."""
+
+    def error(self, message: str) -> None:  # type: ignore[override]
+        self.exit(EXIT_USAGE, f"relnav: error: {message} (see `{self.prog} --help`)\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = _Parser(prog="relnav", description=DESCRIPTION, epilog=EPILOG, formatter_class=raw)
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=_Parser)
+
+    def command(name: str, run: str, text: str, example: str) -> argparse.ArgumentParser:
+        added = commands.add_parser(
+            name, help=text, description=text, epilog=f"example:\n  {example}", formatter_class=raw
+        )
+        added.set_defaults(run=run)
+        return added
+
+    _replay(command("replay", "nodes.run:replay", "Replay a recording, video or folder and score it.", "relnav replay"))
+    example = "relnav live --source /dev/video0 --camera camera.yaml --mission mission.yaml"
+    _live(command("live", "nodes.run:live", "Navigate on a camera, or on a file as if it were one.", example))
+    example = "relnav detect images/ --camera camera.json --side-m 0.1 --json found.json"
+    _detect(command("detect", "nodes.tools:detect", "Find markers in images, folders, videos and recordings.", example))
+    example = "relnav marker 0 1 2 --side-mm 100 --format pdf --out markers"
+    _marker(command("marker", "nodes.tools:marker", "Draw markers to print, at their exact size.", example))
+    score = command("score", "nodes.tools:score", "Score a recorded run.", "relnav score out/replay/run.mcap")
+    score.add_argument("recording", metavar="RUN", type=Path, help="the run.mcap of a replay or a live run")
+    example = "relnav recover out/live/run.mcap"
+    recover = command("recover", "nodes.tools:recover", "Make a recording whole that was cut off.", example)
+    recover.add_argument("recording", metavar="FILE", type=Path, help="the truncated recording")
+    recover.add_argument("--out", type=Path, help="where the whole one goes (default: FILE.recovered.mcap beside it)")
+    command("doctor", "nodes.doctor:doctor", "Check this installation, and say how to mend it.", "relnav doctor")
+    example = "relnav node detector --mission mission.yaml --connect tcp/router:7447"
+    _node(command("node", "nodes.node:main", "Run one node against a Zenoh router.", example))
+    return parser
+
+
+def _replay(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "recording", nargs="?", help="MCAP recording, video or folder of images (default: the shipped corridor)"
+    )
+    parser.add_argument(
+        "--speed", type=_speed, help="times real time, or max (default: 1 when a viewer is shown, else max)"
+    )
+    parser.add_argument("--direct", action="store_true", help="in this process, without the bus: same results")
+    _run_options(parser, out="out/replay")
+    _source_options(parser)
+
+
+def _live(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--source", required=True, help="/dev/video0, or a recording, video or folder")
+    parser.add_argument("--duration", type=_positive, metavar="S", help="stop after so many seconds")
+    parser.add_argument("--loop", action="store_true", help="play a file again and again")
+    parser.add_argument(
+        "--listen",
+        metavar="ENDPOINT",
+        default="tcp/127.0.0.1:7447",
+        help="where others can join the bus (default: %(default)s)",
+    )
+    _run_options(parser, out="out/live")
+    _source_options(parser)
+
+
+def _run_options(parser: argparse.ArgumentParser, *, out: str) -> None:
+    parser.add_argument("--out", type=Path, default=Path(out), help="folder for the results (default: %(default)s)")
+    parser.add_argument(
+        "--view",
+        choices=("auto", "native", "web", "none"),
+        default="auto",
+        help="Rerun's window, a page in the browser, or only run.rrd (default: what this machine can show)",
+    )
+    parser.add_argument("--connect", metavar="ENDPOINT", help="through a Zenoh router, such as tcp/127.0.0.1:7447")
+    _viewer_ports(parser)
+
+
+def _viewer_ports(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--web-port", type=int, default=9090, help="of the page (default: %(default)s)")
+    parser.add_argument("--grpc-port", type=int, default=9876, help="of the page's data (default: %(default)s)")
+
+
+def _source_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--camera", type=Path, metavar="FILE", help="calibration: JSON, or ROS camera_info YAML")
+    parser.add_argument("--mission", type=Path, metavar="FILE", help="markers, camera mounting, ports, filter (YAML)")
+    parser.add_argument("--scale-camera", action="store_true", help="scale a calibration of another image size")
+    parser.add_argument("--fps", type=_positive, metavar="X", help="frame rate of a folder or video")
+
+
+def _detect(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("paths", nargs="+", metavar="PATH", help="images, folders, videos, MCAP recordings")
+    parser.add_argument("--camera", type=Path, metavar="FILE", help="calibration: without it there are no poses")
+    parser.add_argument("--side-m", type=_positive, metavar="S", help="side of the outer black square in metres")
+    parser.add_argument("--dictionary", metavar="NAME|FILE", help="default: the recording's, else astratag20")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all that was found")
+    parser.add_argument("--annotate", type=Path, metavar="DIR", help="write the pictures with what was found drawn in")
+    parser.add_argument("--scale-camera", action="store_true", help="scale a calibration of another image size")
+
+
+def _marker(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("ids", nargs="+", type=int, metavar="ID", help="numbers in the dictionary")
+    parser.add_argument("--family", default="astratag20", metavar="F", help="dictionary (default: %(default)s)")
+    parser.add_argument("--side-mm", type=_positive, default=100.0, metavar="S", help="outer square (%(default)s mm)")
+    parser.add_argument("--format", choices=("svg", "pdf", "png"), default="svg", help="default: %(default)s")
+    parser.add_argument("--out", type=Path, default=Path("out/markers"), help="folder (default: %(default)s)")
+
+
+def _node(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", choices=("source", "detector", "pose_filter", "recorder", "viewer"))
+    parser.add_argument("--connect", metavar="ENDPOINT", default="tcp/127.0.0.1:7447", help="default: %(default)s")
+    parser.add_argument("--out", type=Path, default=Path("out/live"), help="recorder, viewer: folder (%(default)s)")
+    parser.add_argument("--source", help="source: /dev/video0, or a recording, video or folder")
+    parser.add_argument("--loop", action="store_true", help="source: play a file again and again")
+    parser.add_argument("--view", choices=("native", "web", "none"), default="none", help="viewer (%(default)s)")
+    parser.add_argument("--bind", default="127.0.0.1", help="viewer: address of the page (%(default)s)")
+    _viewer_ports(parser)
+    _source_options(parser)
+    # What only the supervisor says.
+    for flag in ("--hub", "--companions", "--resume"):
+        parser.add_argument(flag, help=argparse.SUPPRESS)
+    for flag in ("--lossless", "--supervised"):
+        parser.add_argument(flag, action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--speed", type=_speed, default=1.0, help=argparse.SUPPRESS)
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be positive, got {text}")
+    return value
+
+
+def _speed(text: str) -> float:
+    """Return a speed; max is infinity."""
+    return float("inf") if text == "max" else _positive(text)

@@ -1,0 +1,224 @@
+"""The frame source as a node: what sets the pace.
+
+Replay: a few frames in flight, at most ``WINDOW`` ahead of what every companion has acknowledged.
+Live: frames when they are due, never waiting for anybody.  A recording played live is retimed, as if the
+camera looked at it now, and what is overdue is left out.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+
+from nodes.bus import Bus, Credit, Presence
+from nodes.health import Health
+from nodes.processes import process_named
+from nodes.shell import JOIN_PATIENCE_S, POLL_S, NodeError, NodeOptions, StopSignal
+from schemas import Envelope, Stamp, Truth, encode
+from schemas.topics import CALIBRATION, FRAME
+
+WINDOW = 8
+"""Frames in flight in a replay: enough to keep every node busy, few enough to bound memory and latency."""
+STALL_PATIENCE_S = 60.0
+OVERDUE_NS = 100_000_000
+NS_PER_S = 1_000_000_000
+
+
+class Frames(Protocol):
+    """What the node needs of a source."""
+
+    @property
+    def live(self) -> bool:
+        """Tell whether it is a camera, which sets the pace itself."""
+        ...
+
+    def envelopes(self) -> Iterator[Envelope]:
+        """Yield the calibration, then frame by frame."""
+        ...
+
+
+@dataclass(frozen=True)
+class Resume:
+    """Where a source that was killed had got to: the last frame's number, and when it was captured."""
+
+    sequence: int
+    t_capture_ns: int
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How fast frames are published, and how often the recording is played."""
+
+    speed: float | None = 1.0
+    """Times real time; None: as fast as the others can follow (replay only)."""
+    loop: bool = False
+    resume: Resume | None = None
+
+
+class SourceNode:
+    """Publishes one source from its first frame to its last."""
+
+    def __init__(self, source: Frames, pace: Pace, options: NodeOptions, bus: Bus, stop: StopSignal) -> None:
+        self._source, self._pace, self._options, self._bus, self._stop = source, pace, options, bus, stop
+        self._health = Health("source", options.mission.vehicle)
+        self._absent = set(options.companions)
+        self._credits: dict[str, int] = {}
+        self._published: dict[str, int] = {}
+
+    def run(self) -> None:
+        """Publish, then wait to be stopped.  Raises NodeError when a replay cannot go on."""
+        self._bus.watch(self._options.companions)
+        self._await_companions()
+        self._bus.announce()
+        if self._source.live:
+            self._run_camera()
+        elif self._options.lossless:
+            self._run_replay()
+        else:
+            self._run_as_camera()
+        self._bus.send(Credit("source", self._health.last_sequence, ended=True, published=self._published))
+        while not self._stop.is_set():
+            self._turn(POLL_S)
+
+    def _await_companions(self) -> None:
+        ready = self._turn_until(lambda: not self._absent, JOIN_PATIENCE_S)
+        if not ready and self._options.lossless and not self._stop.is_set():
+            raise NodeError(f"waited {JOIN_PATIENCE_S:.0f} s for {', '.join(sorted(self._absent))}")
+
+    def _run_replay(self) -> None:
+        start_s = t_first_ns = None
+        newest = -1
+        for envelope in self._source.envelopes():
+            stamp = envelope.stamp
+            if envelope.topic is not CALIBRATION and stamp.sequence > newest:
+                newest = stamp.sequence
+                self._await_credit(newest)
+                if self._pace.speed is not None:
+                    if start_s is None or t_first_ns is None:
+                        start_s, t_first_ns = time.monotonic(), stamp.t_capture_ns
+                    due_s = start_s + (stamp.t_capture_ns - t_first_ns) / NS_PER_S / self._pace.speed
+                    self._wait_until(due_s)
+            if self._stop.is_set():
+                return
+            self._publish(envelope)
+
+    def _run_as_camera(self) -> None:
+        shift_ns = None
+        for envelope in repeated(self._source.envelopes, loop=self._pace.loop):
+            stamp = envelope.stamp
+            resume = self._pace.resume
+            if envelope.topic is CALIBRATION:
+                self._publish(envelope)
+                continue
+            if shift_ns is None:
+                if resume is None:
+                    shift_ns = time.time_ns() - stamp.t_capture_ns
+                elif stamp.sequence < resume.sequence:
+                    continue
+                else:
+                    shift_ns = resume.t_capture_ns - stamp.t_capture_ns
+            t_live_ns = stamp.t_capture_ns + shift_ns
+            wait_ns = t_live_ns - time.time_ns()
+            if wait_ns < -OVERDUE_NS:
+                continue
+            self._wait_until(time.monotonic() + wait_ns / NS_PER_S)
+            if self._stop.is_set():
+                return
+            self._publish(retimed(envelope, t_live_ns))
+
+    def _run_camera(self) -> None:
+        first = 0 if self._pace.resume is None else self._pace.resume.sequence + 1
+        for envelope in self._source.envelopes():
+            if self._stop.is_set():
+                return
+            stamp = replace(envelope.stamp, sequence=envelope.stamp.sequence + first)
+            self._publish(replace(envelope, stamp=stamp))
+            self._turn(0.0)
+
+    def _publish(self, envelope: Envelope) -> None:
+        stamp = replace(envelope.stamp, t_origin_ns=time.time_ns())
+        self._bus.publish(replace(envelope, stamp=stamp))
+        name = envelope.topic.name
+        self._published[name] = self._published.get(name, 0) + 1
+        self._health.published += 1
+        if envelope.topic is FRAME:
+            self._health.last_sequence = stamp.sequence
+
+    def _await_credit(self, sequence: int) -> None:
+        """Wait until frame ``sequence`` may be published."""
+
+        def laggards() -> list[str]:
+            return [node for node, done in self._credits.items() if done < sequence - WINDOW]
+
+        if not self._turn_until(lambda: not laggards(), STALL_PATIENCE_S) and not self._stop.is_set():
+            raise NodeError(
+                f"no progress for {STALL_PATIENCE_S:.0f} s before frame {sequence}: waiting for {', '.join(laggards())}"
+            )
+
+    def _wait_until(self, due_s: float) -> None:
+        while not self._stop.is_set() and (left_s := due_s - time.monotonic()) > 0:
+            self._turn(min(left_s, POLL_S))
+
+    def _turn_until(self, condition: Callable[[], bool], patience_s: float) -> bool:
+        deadline_s = time.monotonic() + patience_s
+        while not condition():
+            if self._stop.is_set() or time.monotonic() > deadline_s:
+                return False
+            self._turn(POLL_S)
+        return True
+
+    def _turn(self, timeout_s: float) -> None:
+        match self._bus.mailbox.get(timeout_s):
+            case Presence(node=node, alive=True) if node in self._absent:
+                self._absent.discard(node)
+                self._credits[node] = -1
+            case Presence(node=node, alive=False) if not process_named(node).required:
+                self._credits.pop(node, None)  # missed, not waited for
+            case Credit(node=node, ended=True) if node in self._absent:
+                self._absent.discard(node)  # it died before it came up
+            case Credit(node=node, sequence=sequence) if node in self._credits:
+                self._credits[node] = sequence
+        self._health.publish_when_due(self._bus)
+
+
+def repeated(envelopes: Callable[[], Iterable[Envelope]], *, loop: bool) -> Iterator[Envelope]:
+    """Yield a recording once, or for ever with sequence numbers and stamps that go on."""
+    sequence_offset = t_offset_ns = 0
+    for pass_number in itertools.count():
+        first: Stamp | None = None
+        last: Stamp | None = None
+        for envelope in envelopes():
+            if envelope.topic is CALIBRATION:
+                if pass_number == 0:
+                    yield envelope
+                continue
+            if envelope.topic is FRAME:
+                first, last = first or envelope.stamp, envelope.stamp
+            stamp = replace(
+                envelope.stamp,
+                sequence=envelope.stamp.sequence + sequence_offset,
+                t_capture_ns=envelope.stamp.t_capture_ns + t_offset_ns,
+            )
+            yield replace(envelope, stamp=stamp)
+        if not loop or first is None or last is None:
+            return
+        frames = last.sequence - first.sequence
+        duration_ns = last.t_capture_ns - first.t_capture_ns
+        sequence_offset += frames + 1
+        t_offset_ns += duration_ns + (duration_ns // frames if frames else NS_PER_S)
+
+
+def retimed(envelope: Envelope, t_capture_ns: int) -> Envelope:
+    """Return an envelope as if captured at ``t_capture_ns``, in its stamp and in its message."""
+    message = envelope.message()
+    if isinstance(message, CompressedImage | CameraCalibration):
+        message.timestamp.FromNanoseconds(t_capture_ns)
+    elif isinstance(message, Truth):
+        message = message.model_copy(update={"t_capture_ns": t_capture_ns})
+    return replace(envelope, payload=encode(message), stamp=replace(envelope.stamp, t_capture_ns=t_capture_ns))

@@ -1,0 +1,254 @@
+"""The supervisor: starts the nodes of a run, watches them, starts them again, and stops them.
+
+Replay: the run is over when every node has ended.  A required node that dies ends it with an error.
+Live: the run is over when the source has ended, the time is up or the user stops it.  A node that dies is
+started again at once while the others go on.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from nodes.bus import Bus, Credit, Link, Presence, Received
+from nodes.processes import Process
+from schemas import CodecError, RelativeState, Stamp
+from schemas.topics import STATE
+
+POLL_S = 0.02
+STOP_PATIENCE_S = 3.0
+FINISH_PATIENCE_S = 15.0
+"""For recorder and viewer to finish their files."""
+MOST_RESTARTS = 5
+RESTART_MEMORY_S = 30.0
+ERROR_PREFIX = "relnav: error: "
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
+"""Nodes are parallel by being processes."""
+
+
+class RunError(ValueError):
+    """A run that did not do its job; the message is one line for the user."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to run."""
+
+    processes: tuple[Process, ...]
+    arguments: Mapping[str, Sequence[str]]
+    """What each node's command line gets beyond what all get."""
+    node_link: Link
+    own_link: Link
+    """The supervisor's: the hub, or a client of the router like the nodes."""
+    vehicle: str
+    lossless: bool
+    mission_path: str
+    duration_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Hooks:
+    """How the run is shown while it lasts."""
+
+    on_state: Callable[[Stamp, RelativeState], None] = lambda stamp, state: None
+    on_note: Callable[[str], None] = lambda note: None
+
+
+@dataclass
+class Child:
+    """One running node."""
+
+    process: Process
+    popen: subprocess.Popen[str]
+    alive: bool = False
+    """It has announced itself on the bus."""
+    died_s: float | None = None
+    """When the one before it died, until it has announced itself."""
+    ended: bool = False
+    lines: deque[str] = field(default_factory=lambda: deque(maxlen=50))
+
+    def epitaph(self) -> str:
+        """Return in a few words why it is no more."""
+        code = self.popen.returncode
+        if code < 0:
+            return f"killed by {signal.Signals(-code).name}"
+        errors = [line.removeprefix(ERROR_PREFIX) for line in self.lines if line.startswith(ERROR_PREFIX)]
+        return (errors or [line for line in self.lines if line.strip()] or [f"exit code {code}"])[-1]
+
+
+class Supervisor:
+    """One run from its start to its end."""
+
+    def __init__(self, plan: Plan, hooks: Hooks | None = None) -> None:
+        self._plan, self._hooks = plan, hooks or Hooks()
+        self._children: dict[str, Child] = {}
+        self._restarts: dict[str, list[float]] = {process.name: [] for process in plan.processes}
+        self._interrupted = threading.Event()
+        self._last_frame: Stamp | None = None
+        self._live_since_s: float | None = None
+        self._missed: set[str] = set()
+        self._excuse_due_s = 0.0
+
+    def run(self) -> bool:
+        """Run to the end and return True, or False when the user stopped it.  Raises RunError and BusError."""
+        plan = self._plan
+        previous = {number: signal.signal(number, self._interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            with Bus(plan.own_link, vehicle=plan.vehicle, node="supervisor", lossless=plan.lossless) as bus:
+                bus.subscribe([STATE])
+                bus.watch()
+                try:
+                    for process in reversed(plan.processes):  # whoever is waited for first
+                        self._start(process)
+                    while not self._interrupted.is_set() and not self._finished():
+                        self._turn(bus)
+                        self._excuse_missed(bus)
+                finally:
+                    self._stop()
+                self._empty(bus)
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+        return not self._interrupted.is_set()
+
+    def pid(self, name: str) -> int | None:
+        """Return a node's process id, None when it is not running."""
+        child = self._children.get(name)
+        return None if child is None else child.popen.pid
+
+    def _interrupt(self, *_: object) -> None:
+        self._interrupted.set()
+
+    def _start(self, process: Process, *, died_s: float | None = None) -> None:
+        plan = self._plan
+        command = [sys.executable, "-m", "nodes", "node", process.name, "--supervised", "--mission", plan.mission_path]
+        command += ["--connect" if plan.node_link.role == "client" else "--hub", plan.node_link.endpoint]
+        if plan.lossless:
+            command += ["--lossless", "--companions", ",".join(p.name for p in plan.processes if p.name != "source")]
+        elif process.name == "source":
+            command += ["--companions", ",".join(p.name for p in plan.processes if p.required and p.name != "source")]
+            if self._last_frame is not None:
+                command += ["--resume", f"{self._last_frame.sequence}:{self._last_frame.t_capture_ns}"]
+        popen = subprocess.Popen(
+            [*command, *plan.arguments.get(process.name, ())],
+            stdin=subprocess.PIPE,  # its end tells the node that we are gone
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+            env=os.environ | ONE_THREAD,
+            start_new_session=True,  # a Ctrl-C is for us: we stop the nodes in order
+        )
+        child = Child(process, popen, died_s=died_s)
+        self._children[process.name] = child
+        threading.Thread(target=self._read_lines, args=(child,), daemon=True).start()
+
+    def _read_lines(self, child: Child) -> None:
+        assert child.popen.stderr is not None
+        for line in child.popen.stderr:
+            child.lines.append(line.rstrip())
+            if line.startswith("relnav: warning: "):
+                self._hooks.on_note(line.rstrip().removeprefix("relnav: "))
+
+    def _turn(self, bus: Bus) -> None:
+        event = bus.mailbox.get(POLL_S)
+        match event:
+            case Received():
+                self._show(event)
+            case Presence(node=name, alive=True) if name in self._children:
+                self._welcome(self._children[name])
+            case Credit(node=name, ended=True) if name in self._children:
+                self._children[name].ended = True
+        for child in list(self._children.values()):
+            if child.popen.poll() is not None:
+                self._mourn(child)
+
+    def _show(self, received: Received) -> None:
+        stamp = received.envelope.stamp
+        if self._last_frame is None or stamp.sequence > self._last_frame.sequence:
+            self._last_frame = stamp
+        if received.envelope.payload:
+            try:
+                message = received.envelope.message()
+            except CodecError:
+                return
+            assert isinstance(message, RelativeState)
+            self._hooks.on_state(stamp, message)
+
+    def _welcome(self, child: Child) -> None:
+        child.alive = True
+        if child.died_s is not None:
+            self._hooks.on_note(f"{child.process.name} is back after {time.monotonic() - child.died_s:.1f} s")
+            child.died_s = None
+        if self._live_since_s is None and child.process.name == "source":
+            self._live_since_s = time.monotonic()
+
+    def _mourn(self, child: Child) -> None:
+        name, now_s = child.process.name, time.monotonic()
+        del self._children[name]
+        _join_pipes(child)
+        why = child.epitaph()
+        if self._plan.lossless:
+            if child.process.required:
+                raise RunError(f"{name}: {why}" if child.popen.returncode > 0 else f"the {name} died: {why}")
+            self._hooks.on_note(f"warning: the {name} died ({why}); the run goes on without it")
+            self._missed.add(name)
+            return
+        self._restarts[name] = [t for t in self._restarts[name] if now_s - t < RESTART_MEMORY_S] + [now_s]
+        hopeless = len(self._restarts[name]) > MOST_RESTARTS or (not child.alive and child.popen.returncode > 0)
+        if hopeless and child.process.required:
+            raise RunError(f"{name}: {why}")
+        if hopeless:
+            self._hooks.on_note(f"warning: the {name} does not stay up ({why}); the run goes on without it")
+            return
+        self._hooks.on_note(f"warning: the {name} died ({why}); starting it again")
+        self._start(child.process, died_s=now_s if child.died_s is None else child.died_s)
+
+    def _excuse_missed(self, bus: Bus) -> None:
+        """Say until the source starts, to nodes that may still be coming up, for whom not to wait."""
+        if self._missed and self._live_since_s is None and time.monotonic() >= self._excuse_due_s:
+            self._excuse_due_s = time.monotonic() + 0.2
+            for name in self._missed:
+                bus.send(Credit(name, ended=True))
+
+    def _finished(self) -> bool:
+        if self._plan.lossless:
+            return all(child.ended for child in self._children.values())
+        source = self._children.get("source")
+        duration_s, since_s = self._plan.duration_s, self._live_since_s
+        time_up = duration_s is not None and since_s is not None and time.monotonic() - since_s >= duration_s
+        return time_up or (source is not None and source.ended)
+
+    def _stop(self) -> None:
+        """Stop those who speak before those who listen, so that nothing said is lost."""
+        speakers = [child for child in self._children.values() if child.process.publishes]
+        listeners = [child for child in self._children.values() if not child.process.publishes]
+        for group, patience_s in ((speakers, STOP_PATIENCE_S), (listeners, FINISH_PATIENCE_S)):
+            for child in group:
+                child.popen.send_signal(signal.SIGTERM)
+            deadline_s = time.monotonic() + patience_s
+            for child in group:
+                try:
+                    child.popen.wait(max(deadline_s - time.monotonic(), 0.01))
+                except subprocess.TimeoutExpired:
+                    child.popen.kill()
+                    child.popen.wait()
+                    self._hooks.on_note(f"warning: the {child.process.name} did not stop when told and was killed")
+                _join_pipes(child)
+
+    def _empty(self, bus: Bus) -> None:
+        while (event := bus.mailbox.get(0.0)) is not None:
+            if isinstance(event, Received):
+                self._show(event)
+
+
+def _join_pipes(child: Child) -> None:
+    if child.popen.stdin is not None:
+        child.popen.stdin.close()

@@ -1,0 +1,74 @@
+"""The commands that need no bus: ``relnav detect``, ``marker``, ``score`` and ``recover``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from typing import Any
+
+from rich.console import Console
+
+
+def detect(args: argparse.Namespace) -> None:
+    """Find markers in pictures, list them, and write them as JSON and as annotated pictures."""
+    from pipeline.detect import detect_paths
+
+    console = Console(highlight=False, soft_wrap=True)
+    found = detect_paths(
+        args.paths,
+        dictionary=args.dictionary,
+        side_m=args.side_m,
+        camera_path=args.camera,
+        scale_camera=args.scale_camera,
+        annotate_dir=args.annotate,
+        on_progress=lambda image: console.print(image_line(image), markup=False),
+    )
+    for skipped in found["skipped"]:
+        print(f"relnav: warning: skipped {skipped['path']}: {skipped['reason']}", file=sys.stderr)
+    if args.json is not None:
+        args.json.parent.mkdir(parents=True, exist_ok=True)
+        args.json.write_text(json.dumps(found, indent=2) + "\n")
+
+
+def image_line(image: dict[str, Any]) -> str:
+    """Return one line for an image's entry."""
+    markers = []
+    for detection in image["detections"]:
+        layers = "+".join(str(layer["layer"]) for layer in detection["layers"])
+        pose = detection["T_cam_marker"]
+        where = "" if pose is None else f" at {sum(x * x for x in pose['translation_m']) ** 0.5:.3f} m"
+        markers.append(
+            f"{detection['family']} {detection['marker_id']} (layers {layers}, {detection['method']}){where}"
+        )
+    return f"{image['path']}: {'; '.join(markers) or 'no marker'}"
+
+
+def marker(args: argparse.Namespace) -> None:
+    """Write the artwork of markers and list the files."""
+    from astratag.artwork import write_artwork
+    from astratag.dictionary import load_dictionary
+
+    dictionary = load_dictionary(args.family)
+    for marker_id in args.ids:
+        path = args.out / f"{dictionary.family}_{marker_id:02d}_{args.side_mm:g}mm.{args.format}"
+        print(write_artwork(dictionary, marker_id, path, side_m=args.side_mm / 1000.0))
+
+
+def score(args: argparse.Namespace) -> None:
+    """Print a recorded run's score."""
+    from pipeline.scoring import print_table
+    from pipeline.scoring import score as score_recording
+
+    print_table(score_recording(args.recording), Console(highlight=False))
+
+
+def recover(args: argparse.Namespace) -> None:
+    """Make a recording whole."""
+    from pipeline.recording import recover as recover_recording
+
+    report = recover_recording(args.recording, args.out)
+    if report.whole:
+        print(f"{report.out} is whole: {report.messages} messages, nothing to recover")
+    else:
+        print(f"{report.out}: {report.messages} messages recovered, {report.lost_bytes} bytes lost")
