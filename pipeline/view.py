@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import quote
@@ -67,7 +68,8 @@ KEPT_FRAMES = 256
 """Frames for which a truth waits for its state, or the other way round."""
 NIS_BAND = (0.025, 0.975)
 SIGMAS = 3.0
-CHASER_M = (0.16, 0.12, 0.14)
+HIDDEN_SCALE = 1e-6
+CHASER_M = (0.14, 0.14, 0.16)
 """The chaser as drawn: width, height and depth behind its docking port."""
 
 ESTIMATE, TRUE, BOUND, CORRIDOR, GRID = 0x4CB8FFFF, 0x8CE05AFF, 0x8B93A3FF, 0x9B7BFFFF, 0xFFFFFF50
@@ -95,15 +97,25 @@ IMAGE = f"{CAMERA}/image"
 OVERLAY = f"{CAMERA}/overlay"
 PATHS = ("scene/estimate/path", "scene/truth/path")
 
+PLOTS = (
+    ("range_m", "Range, port to port [m]"),
+    ("lateral_mm", "Lateral offset [mm]"),
+    ("closing_mm_s", "Closing speed [mm/s]"),
+    ("seen", "Seen in the picture"),
+    ("position_error_mm", "Position error [mm]"),
+    ("attitude_error_deg", "Attitude error [deg]"),
+    ("nis", "NIS per degree of freedom"),
+    ("latency_ms", "Latency, frame to state [ms]"),
+)
+WITH_LEGEND = ("range_m", "seen", "position_error_mm")
+
 LEGEND = """\
 A **chaser** flies down a corridor to a **target** and measures where it is from the printed markers.
 
-**Blue** estimated · **green** true, when recorded · **grey** three-sigma bound · **violet** approach corridor
-
-Marker layers: **yellow** outer · **orange** middle · **red** inner; *dashed* when predicted, not seen.
-
-The blue ellipsoid holds the chaser with three sigma. Errors should stay below their grey bound, and NIS \
-inside its band 95 % of the time.
+- **blue** estimated, **green** true (when recorded)
+- **grey** three-sigma and 95 % bounds
+- **violet** approach corridor
+- marker layers: **yellow** outer, **orange** middle, **red** inner; *dashed* predicted, *white grid* curved print
 """
 
 
@@ -132,8 +144,8 @@ class Viewer:
         self._mission = mission
         self._warn = warn or logging.getLogger(__name__).warning
         self._camera: Camera | None = None
-        self._truths: dict[int, Truth] = {}
-        self._states: dict[int, RelativeState] = {}
+        self._halves: dict[int, dict[str, Array]] = {}
+        """By frame, T_chaser_target of an estimate that waits for its truth, or the other way round."""
         self._last: dict[str, Any] = {}
         """What was drawn last, where only a change is drawn."""
         self._T_chaser_port = mission.T_chaser_port.matrix()
@@ -166,7 +178,7 @@ class Viewer:
         message = envelope.message()
         for stream in self._streams():
             stream.set_time("frame", sequence=envelope.stamp.sequence)
-            stream.set_time("capture_time", timestamp=1e-9 * envelope.stamp.t_capture_ns)
+            stream.set_time("capture_time", timestamp=np.datetime64(envelope.stamp.t_capture_ns, "ns"))
         handler(message, envelope, t_receipt_ns)
 
     def close(self) -> None:
@@ -212,8 +224,12 @@ class Viewer:
         )
         markers = [(m.id, m.T_target_marker.matrix(), m.side_m, m.surface.surface()) for m in self._mission.markers]
         self._draw_target(markers)
-        self._draw_vehicle(f"{CHASER}/body", ESTIMATE, solid=True)
-        self._draw_vehicle("scene/truth/chaser/body", TRUE, solid=False)
+        self._draw_vehicle("estimate", ESTIMATE)
+        style = rr.Ellipsoids3D.from_fields(
+            colors=[ESTIMATE], fill_mode=rr.components.FillMode.TransparentFillMajorWireframe, line_radii=[-0.5]
+        )
+        self._log("scene/estimate/ellipsoid", style, static=True)
+        self._draw_overlay_styles()
         self._draw_series()
 
     def _draw_target(self, markers: list[tuple[int, Array, float, Surface]]) -> None:
@@ -229,17 +245,33 @@ class Viewer:
             path = f"scene/target/marker_{marker_id}"
             self._log(path, _transform3d(T_target_marker), drawn, static=True)
 
-    def _draw_vehicle(self, path: str, color: int, *, solid: bool) -> None:
+    def _draw_vehicle(self, whose: str, color: int) -> None:
+        """Draw a chaser's hull in its own frame, and style what moves with it."""
         width, height, depth = CHASER_M
-        self._log(path, _transform3d(self._T_chaser_port), static=True)
-        shape = rr.Boxes3D(
+        box = rr.Boxes3D(
             centers=[(0.0, 0.0, -depth / 2)],
             half_sizes=[(width / 2, height / 2, depth / 2)],
-            colors=color & ~0xFF | (0xB0 if solid else 0xFF),
-            fill_mode=rr.components.FillMode.Solid if solid else rr.components.FillMode.MajorWireframe,
+            colors=color,
             radii=rr.Radius.ui_points(1.2),
+            fill_mode=rr.components.FillMode.MajorWireframe,
         )
-        self._log(f"{path}/hull", shape, static=True)
+        hull = f"scene/{whose}/chaser/hull"
+        self._log(hull, _transform3d(self._T_chaser_port), box, static=True)
+        style = rr.LineStrips3D.from_fields(colors=[color], radii=rr.Radius.ui_points(1.5))
+        self._log(f"scene/{whose}/path", style, static=True)
+
+    def _draw_overlay_styles(self) -> None:
+        """Style what is drawn into the picture; radii are in points of the screen, whatever the zoom."""
+        ui_points = rr.Radius.ui_points
+        styles = {
+            "quads": rr.LineStrips2D.from_fields(radii=ui_points(2.0)),
+            "predicted": rr.LineStrips2D.from_fields(colors=[LAYER_COLORS[0]], radii=ui_points(0.75)),
+            "grid": rr.LineStrips2D.from_fields(colors=[GRID], radii=ui_points(0.5)),
+            "axes": rr.LineStrips2D.from_fields(radii=ui_points(1.5)),
+            "labels": rr.Points2D.from_fields(colors=[0xFFFFFFFF], radii=[0.0], show_labels=True),
+        }
+        for name, style in styles.items():
+            self._log(f"{OVERLAY}/{name}", style, static=True)
 
     def _draw_series(self) -> None:
         three_sigma = f"{SIGMAS:.0f} sigma"
@@ -255,22 +287,32 @@ class Viewer:
         _style(self._log, "plots/latency_ms", ["frame to state"], [ESTIMATE])
         _style(self._log, "plots/seen", ["markers", "layers"], [ESTIMATE, LAYER_COLORS[0]])
         modes = [mode.name for mode in Mode]
-        self._log("status/mode", rr.StateConfiguration(values=modes, colors=_rgba(MODE_COLORS.values())), static=True)
-        smallest = rr.StateConfiguration(values=[*LAYER_NAMES, "none"], colors=_rgba((*LAYER_COLORS, 0x3A3F4AFF)))
-        self._log("status/layer", smallest, static=True)
+        self._log(
+            "status/filter_mode", rr.StateConfiguration(values=modes, colors=_rgba(MODE_COLORS.values())), static=True
+        )
+        largest = rr.StateConfiguration(values=[*LAYER_NAMES, "none"], colors=_rgba((*LAYER_COLORS, 0x3A3F4AFF)))
+        self._log("status/largest_layer", largest, static=True)
         inside = rr.StateConfiguration(values=["inside", "outside"], colors=_rgba((CORRIDOR, 0xFF4040FF)))
         self._log("status/corridor", inside, static=True)
 
     # What passes
 
     def _set_camera(self, message: CameraCalibration) -> None:
-        self._camera = camera_from_calibration(message)
-        self._log(CAMERA, _transform3d(self._mission.camera.T_chaser_cam.matrix()), static=True)
+        camera = self._camera = camera_from_calibration(message)
+        pinhole = rr.Pinhole.from_fields(
+            image_from_camera=camera.K,
+            resolution=(camera.width, camera.height),
+            color=ESTIMATE,
+            line_width=-1.0,  # negative: in points of the screen
+        )
+        self._log(CAMERA, pinhole, _transform3d(self._mission.camera.T_chaser_cam.matrix()), static=True)
 
     def _draw_calibration(self, message: CameraCalibration, _envelope: Envelope, _t_ns: int) -> None:
         self._set_camera(message)
 
     def _draw_frame(self, message: CompressedImage, _envelope: Envelope, t_receipt_ns: int) -> None:
+        if "chaser shown" not in self._last:
+            self._hide_chaser()
         image = rr.EncodedImage(contents=message.data, media_type=f"image/{message.format or 'jpeg'}")
         if self._file is not None:
             self._file.log(IMAGE, image)
@@ -281,20 +323,27 @@ class Viewer:
         found = message.detections
         layers = [seen.layer for detection in found for seen in detection.layers]
         self._log("plots/seen", rr.Scalars([len(found), len(layers)]))
-        self._draw_status("layer", LAYER_NAMES[max(layers)] if layers else "none")
+        self._draw_status("largest_layer", LAYER_NAMES[min(layers)] if layers else "none")
         if not found:
             if self._changed("overlay", False):
                 self._log(OVERLAY, rr.Clear(recursive=True))
             return
         self._last["overlay"] = True
-        strips, colors, radii = _outlines(found)
-        self._log(f"{OVERLAY}/quads", rr.LineStrips2D(strips, colors=_rgba(colors), radii=radii))
+        quads = np.array([points_array(seen.corners_px)[[0, 1, 2, 3, 0]] for d in found for seen in d.layers])
+        colors = _rgba(LAYER_COLORS[layer] for layer in layers)
+        self._log(f"{OVERLAY}/quads", rr.LineStrips2D.from_fields(strips=quads, colors=colors))
+        predicted = [dashed(points_array(d.corners_px)) for d in found if all(seen.layer != 0 for seen in d.layers)]
+        self._draw_strips("predicted", predicted)
+        self._draw_strips("grid", [lines for d in found if (lines := _grid_lines(d)) is not None])
         self._draw_labels(message)
-        grids = [strip for detection in found for strip in _grid_strips(detection)]
-        self._log(f"{OVERLAY}/grid", rr.LineStrips2D(grids, colors=GRID, radii=rr.Radius.ui_points(0.5)))
-        axes = [strip for detection in found for strip in self._axis_strips(detection)]
-        colors = [AXIS_COLORS[k % 3] for k in range(len(axes))]
-        self._log(f"{OVERLAY}/axes", rr.LineStrips2D(axes, colors=_rgba(colors), radii=rr.Radius.ui_points(1.5)))
+        axes = [strips for d in found if (strips := self._axis_strips(d)) is not None]
+        colors = _rgba(AXIS_COLORS * len(axes))
+        self._log(f"{OVERLAY}/axes", rr.LineStrips2D.from_fields(strips=_joined(axes), colors=colors))
+
+    def _draw_strips(self, name: str, strips: list[Array]) -> None:
+        """Draw strips (each (n, points, 2), equal points) into the picture; no strips twice are drawn once."""
+        if self._changed(f"{name} drawn", bool(strips)) or strips:
+            self._log(f"{OVERLAY}/{name}", rr.LineStrips2D.from_fields(strips=_joined(strips)))
 
     def _draw_labels(self, message: Detections) -> None:
         """Write each marker's identity above it, inside the image."""
@@ -304,114 +353,108 @@ class Viewer:
             at.append(
                 (
                     np.clip(x.mean(), 0.2 * message.width_px, 0.8 * message.width_px),
-                    np.clip(y.min() - 0.04 * message.height_px, 0.05 * message.height_px, 0.95 * message.height_px),
+                    np.clip(y.min() - 0.06 * message.height_px, 0.05 * message.height_px, 0.95 * message.height_px),
                 )
             )
             layers = "+".join(LAYER_NAMES[seen.layer] for seen in detection.layers)
             labels.append(f"marker {detection.marker_id} · {layers} · {detection.method}")
-        self._log(f"{OVERLAY}/labels", rr.Points2D(at, labels=labels, radii=0.0, colors=0xFFFFFFFF, show_labels=True))
+        self._log(f"{OVERLAY}/labels", rr.Points2D.from_fields(positions=at, labels=labels))
 
-    def _axis_strips(self, detection: Detection) -> list[Array]:
-        """Return the marker's x, y and z axes, half a side long, in the image."""
+    def _axis_strips(self, detection: Detection) -> Array | None:
+        """Return the marker's x, y and z axes (3, 2, 2), half a side long, in the image."""
         if detection.T_cam_marker is None or self._camera is None:
-            return []
+            return None
         T_cam_marker = pose_matrix(detection.T_cam_marker)
         marker = self._mission.marker(detection.marker_id)
         length_m = 0.5 * (marker.side_m if marker else self._mission.default_side_m)
         ends_cam = transform(T_cam_marker, length_m * np.vstack([np.zeros(3), np.eye(3)]))
         if (ends_cam[:, 2] < 0.1 * length_m).any():
-            return []
+            return None
         origin, *ends = self._camera.project(ends_cam)
-        return [np.stack([origin, end]) for end in ends]
+        return np.array([(origin, end) for end in ends])
 
     def _draw_state(self, state: RelativeState, envelope: Envelope, t_receipt_ns: int) -> None:
-        self._draw_status("mode", state.mode.name)
+        self._draw_status("filter_mode", state.mode.name)
         if envelope.stamp.t_origin_ns > 0:
             self._log("plots/latency_ms", rr.Scalars(1e-6 * (t_receipt_ns - envelope.stamp.t_origin_ns)))
         if state.nis is not None and state.nis_dof > 0:
+            self._last["nis"] = True
             self._log("plots/nis/nis", rr.Scalars(state.nis / state.nis_dof))
-            self._log("plots/nis/bound", rr.Scalars(chi2.ppf(NIS_BAND, state.nis_dof) / state.nis_dof))
+            self._log("plots/nis/bound", rr.Scalars(_nis_band(state.nis_dof)))
+        elif self._changed("nis", False):
+            self._log("plots/nis/nis", rr.Scalars(np.nan))  # a gap in the line
         if state.port is not None:
             self._draw_status("corridor", "inside" if state.port.in_corridor else "outside")
         if state.T_chaser_target is None:
+            self._hide_chaser()
             return
         if not self._mission.markers and state.marker_ids and self._changed("target", state.marker_ids[0]):
             self._draw_target([(state.marker_ids[0], np.eye(4), self._mission.default_side_m, Flat())])
-        self._draw_estimate(state)
-        truth = self._truths.pop(envelope.stamp.sequence, None)
-        if truth is not None:
-            self._draw_errors(state, truth)
-        else:
-            _keep(self._states, envelope.stamp.sequence, state)
+        T_chaser_target = pose_matrix(state.T_chaser_target)
+        self._draw_estimate(state, T_chaser_target)
+        self._draw_errors(envelope.stamp.sequence, estimate=T_chaser_target)
 
-    def _draw_estimate(self, state: RelativeState) -> None:
-        motion = self._motion(state)
-        assert motion is not None and state.T_chaser_target is not None
-        self._draw_chaser("estimate", pose_matrix(state.T_chaser_target), motion, ESTIMATE)
+    def _draw_estimate(self, state: RelativeState, T_chaser_target: Array) -> None:
+        motion = self._motion(state, T_chaser_target)
+        self._last["chaser shown"] = True
+        self._draw_chaser("estimate", T_chaser_target, motion)
         self._draw_frustum(motion.range_m)
-        covariance = None if state.covariance is None else np.reshape(state.covariance, (12, 12))
-        values = (motion.range_m, 1e3 * motion.lateral_m, 1e3 * motion.closing_m_s)
-        for name, value in zip(("range_m", "lateral_mm", "closing_mm_s"), values, strict=True):
-            self._log(f"plots/{name}/estimate", rr.Scalars(value))
-        if covariance is None:
+        if state.covariance is None:
             return
-        rows = (motion.range_by, 1e3 * motion.lateral_by, 1e3 * motion.closing_by)
-        for name, value, row in zip(("range_m", "lateral_mm", "closing_mm_s"), values, rows, strict=True):
+        covariance = np.reshape(state.covariance, (12, 12))
+        for name, scale, value, row in motion.plotted():
             bound = SIGMAS * np.sqrt(row @ covariance @ row)
-            self._log(f"plots/{name}/bound", rr.Scalars([value + bound, value - bound]))
+            low = value - bound if name == "closing_mm_s" else max(value - bound, 0.0)
+            self._log(f"plots/{name}/bound", rr.Scalars([scale * (value + bound), scale * low]))
         position, attitude = (SIGMAS * np.sqrt(np.trace(covariance[k : k + 3, k : k + 3])) for k in (0, 3))
         self._log("plots/position_error_mm/bound", rr.Scalars(1e3 * position))
         self._log("plots/attitude_error_deg/bound", rr.Scalars(np.rad2deg(attitude)))
         half_sizes, quaternion = ellipsoid(motion.jacobian @ covariance @ motion.jacobian.T, SIGMAS)
-        shape = rr.Ellipsoids3D(
-            centers=[motion.p_port_m],
-            half_sizes=[half_sizes],
-            quaternions=[quaternion],
-            colors=ESTIMATE & ~0xFF | 0x60,
-            fill_mode=rr.components.FillMode.Solid,
+        shape = rr.Ellipsoids3D.from_fields(
+            centers=[motion.p_port_m], half_sizes=[half_sizes], quaternions=[rr.Quaternion(xyzw=quaternion)]
         )
         self._log("scene/estimate/ellipsoid", shape)
 
-    def _draw_chaser(self, whose: str, T_chaser_target: Array, motion: PortMotion, color: int) -> None:
-        """Move a chaser, and add the last stretch to its path."""
+    def _draw_chaser(self, whose: str, T_chaser_target: Array, motion: PortMotion) -> None:
+        """Move a chaser, add the last stretch to its path, and plot its motion."""
         self._log(f"scene/{whose}/chaser", _transform3d(chaser_pose(T_chaser_target, self._T_target_port)))
-        before = self._last.get(whose, motion.p_port_m)
+        before = self._last.get(whose)
         self._last[whose] = motion.p_port_m
-        stretch = rr.LineStrips3D([[before, motion.p_port_m]], colors=color, radii=rr.Radius.ui_points(1.5))
-        self._log(f"scene/{whose}/path", stretch)
+        if before is not None:
+            self._log(f"scene/{whose}/path", rr.LineStrips3D.from_fields(strips=np.array([[before, motion.p_port_m]])))
+        for name, scale, value, _ in motion.plotted():
+            self._log(f"plots/{name}/{whose}", rr.Scalars(scale * value))
+
+    def _hide_chaser(self) -> None:
+        """Shrink the estimated chaser to a point: there is no state, and nowhere to draw it."""
+        if self._changed("chaser shown", False):
+            self._last.pop("estimate", None)
+            self._log(CHASER, rr.Transform3D(scale=HIDDEN_SCALE))
+            self._log("scene/estimate/ellipsoid", rr.Clear(recursive=False))
 
     def _draw_frustum(self, range_m: float) -> None:
         """Keep the picture in the frustum between the camera and what it looks at."""
         distance_m = float(np.clip(0.4 * range_m, 0.02, 0.3))
-        if self._camera is None or abs(distance_m / self._last.get("frustum", 1e9) - 1) < 0.05:
-            return
-        self._last["frustum"] = distance_m
-        camera = self._camera
-        pinhole = rr.Pinhole(
-            image_from_camera=camera.K,
-            resolution=(camera.width, camera.height),
-            image_plane_distance=distance_m,
-            color=ESTIMATE,
-            line_width=-1.0,  # negative: in points of the screen
-        )
-        self._log(CAMERA, pinhole)
+        if abs(distance_m / self._last.get("frustum", np.inf) - 1) > 0.05:
+            self._last["frustum"] = distance_m
+            self._log(CAMERA, rr.Pinhole.from_fields(image_plane_distance=distance_m))
 
     def _draw_truth(self, truth: Truth, envelope: Envelope, _t_ns: int) -> None:
-        motion = self._motion(truth)
-        assert motion is not None
-        self._draw_chaser("truth", pose_matrix(truth.T_chaser_target), motion, TRUE)
-        values = (motion.range_m, 1e3 * motion.lateral_m, 1e3 * motion.closing_m_s)
-        for name, value in zip(("range_m", "lateral_mm", "closing_mm_s"), values, strict=True):
-            self._log(f"plots/{name}/truth", rr.Scalars(value))
-        state = self._states.pop(envelope.stamp.sequence, None)
-        if state is not None:
-            self._draw_errors(state, truth)
-        else:
-            _keep(self._truths, envelope.stamp.sequence, truth)
+        if "truth" not in self._last:
+            self._draw_vehicle("truth", TRUE)
+        T_chaser_target = pose_matrix(truth.T_chaser_target)
+        self._draw_chaser("truth", T_chaser_target, self._motion(truth, T_chaser_target))
+        self._draw_errors(envelope.stamp.sequence, truth=T_chaser_target)
 
-    def _draw_errors(self, state: RelativeState, truth: Truth) -> None:
-        assert state.T_chaser_target is not None
-        error = difference(pose_matrix(truth.T_chaser_target), pose_matrix(state.T_chaser_target))
+    def _draw_errors(self, sequence: int, **half: Array) -> None:
+        """Plot the errors of a frame when both its estimate and its truth, in either order, have come."""
+        both = self._halves.pop(sequence, {}) | half
+        if len(both) < 2:
+            self._halves[sequence] = both
+            if len(self._halves) > KEPT_FRAMES:
+                del self._halves[next(iter(self._halves))]
+            return
+        error = difference(both["truth"], both["estimate"])
         self._log("plots/position_error_mm/error", rr.Scalars(1e3 * np.linalg.norm(error[:3])))
         self._log("plots/attitude_error_deg/error", rr.Scalars(np.rad2deg(np.linalg.norm(error[3:]))))
 
@@ -428,20 +471,21 @@ class Viewer:
         before, self._last[what] = self._last.get(what), value
         return before != value
 
-    def _motion(self, of: RelativeState | Truth) -> PortMotion | None:
-        if of.T_chaser_target is None:
-            return None
-        velocity = np.zeros(3) if of.v_chaser_target_m_s is None else vector_array(of.v_chaser_target_m_s)
-        omega = of.omega_chaser_target_in_target_rad_s
-        rate = np.zeros(3) if omega is None else vector_array(omega)
-        return port_motion(pose_matrix(of.T_chaser_target), velocity, rate, self._T_chaser_port, self._T_target_port)
+    def _motion(self, of: RelativeState | Truth, T_chaser_target: Array) -> PortMotion:
+        v, omega = of.v_chaser_target_m_s, of.omega_chaser_target_in_target_rad_s
+        return port_motion(
+            T_chaser_target,
+            np.zeros(3) if v is None else vector_array(v),
+            np.zeros(3) if omega is None else vector_array(omega),
+            self._T_chaser_port,
+            self._T_target_port,
+        )
 
 
-def _keep(waiting: dict[int, Any], sequence: int, message: Any) -> None:
-    """Keep a message for its partner of the same frame, and forget the oldest."""
-    waiting[sequence] = message
-    if len(waiting) > KEPT_FRAMES:
-        del waiting[next(iter(waiting))]
+@lru_cache
+def _nis_band(dof: int) -> Array:
+    """Return the interval that holds NIS per degree of freedom 95 % of the time."""
+    return chi2.ppf(NIS_BAND, dof) / dof
 
 
 def _transform3d(T_a_b: Array) -> rr.Transform3D:
@@ -468,88 +512,67 @@ def _style(log: Callable[..., None], path: str, names: list[str], colors: list[i
     log(path, rr.SeriesLines(names=names, colors=_rgba(colors), widths=[width] * len(names)), static=True)
 
 
-def _outlines(found: list[Detection]) -> tuple[list[Array], list[int], list[float]]:
-    """Return strips, colours and radii of the layers seen; an outer square that is only predicted is dashed."""
-    strips: list[Array] = []
-    colors: list[int] = []
-    radii: list[float] = []
-    for detection in found:
-        if all(seen.layer != 0 for seen in detection.layers):
-            dashes = dashed(points_array(detection.corners_px))
-            strips += dashes
-            colors += [LAYER_COLORS[0]] * len(dashes)
-            radii += [-0.75] * len(dashes)
-        for seen in detection.layers:
-            corners = points_array(seen.corners_px)
-            strips.append(np.vstack([corners, corners[:1]]))
-            colors.append(LAYER_COLORS[seen.layer])
-            radii.append(-2.0)  # negative: in points of the screen
-    return strips, colors, radii
+def _joined(strips: list[Array]) -> NDArray[np.float32]:
+    """Return strips (n, points, 2) as one array."""
+    return np.concatenate(strips, dtype=np.float32) if strips else np.zeros((0, 2, 2), np.float32)
 
 
-def _grid_strips(detection: Detection) -> list[Array]:
-    """Return the rows and columns of the grid on which a curved print was read."""
+def _grid_lines(detection: Detection) -> Array | None:
+    """Return the rows and columns of the grid on which a curved print was read, (lines, points, 2)."""
     warp = detection.warp_grid
-    if warp is None:
-        return []
+    if warp is None or warp.rows != warp.columns:
+        return None
     grid = points_array(warp.points_px).reshape(warp.rows, warp.columns, 2)
-    return [*grid, *grid.transpose(1, 0, 2)]
+    return np.concatenate([grid, grid.transpose(1, 0, 2)])
 
 
 def _blueprint(mission: Mission) -> rrb.Blueprint:
     """Return the layout: camera and scene above, status beside them, plots below."""
     start_m = mission.corridor.start_m
-    plots = (
-        ("range_m", "Range, port to port [m]"),
-        ("lateral_mm", "Lateral offset [mm]"),
-        ("closing_mm_s", "Closing speed [mm/s]"),
-        ("seen", "Markers and layers seen"),
-        ("position_error_mm", "Position error [mm]"),
-        ("attitude_error_deg", "Attitude error [deg]"),
-        ("nis", "NIS per degree of freedom"),
-        ("latency_ms", "Latency, frame to state [ms]"),
+    wide = _scene_view("Approach", start_m * np.array([0.95, 0.6, 1.0]), start_m * np.array([0.0, 0.0, 0.45]))
+    near = _scene_view("Close-up", start_m * np.array([0.26, 0.16, 0.3]), start_m * np.array([0.0, 0.0, 0.06]))
+    events = rrb.TextLogView(origin="events", name="Events", columns=rrb.TextLogColumns(text_log_columns=["Body"]))
+    status = rrb.Vertical(
+        rrb.TextDocumentView(origin="legend", name="What you see"),
+        rrb.StateTimelineView(origin="status", name="Status"),
+        events,
+        row_shares=[0.37, 0.35, 0.28],
     )
-    past = rrb.VisibleTimeRange(
-        "capture_time", start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
+    above = rrb.Horizontal(
+        rrb.Spatial2DView(origin=CAMERA, name="Camera", background=[0, 0, 0]),
+        rrb.Tabs(wide, near),
+        status,
+        column_shares=[0.42, 0.33, 0.25],
     )
-    by_frame = rrb.VisibleTimeRange(
-        "frame", start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
-    )
-    ranges = rrb.archetypes.VisibleTimeRanges([past, by_frame])
-
-    def scene(name: str, position: tuple[float, float, float], target: tuple[float, float, float]) -> rrb.Spatial3DView:
-        return rrb.Spatial3DView(
-            origin="scene",
-            contents=["$origin/**", f"- {OVERLAY}/**"],
-            name=name,
-            background=[18, 20, 26],
-            line_grid=False,
-            eye_controls=rrb.EyeControls3D(position=position, look_target=target, eye_up=(0.0, 1.0, 0.0)),
-            overrides={path: ranges for path in PATHS},
+    plots = [
+        rrb.TimeSeriesView(
+            origin=f"plots/{name}", name=title, plot_legend=rrb.PlotLegend("RightTop", visible=name in WITH_LEGEND)
         )
-
-    wide = scene("Approach", (0.95 * start_m, 0.55 * start_m, 0.9 * start_m), (0.0, 0.0, 0.42 * start_m))
-    near = scene("Close-up", (0.35 * start_m, 0.2 * start_m, 0.32 * start_m), (0.0, 0.0, 0.06 * start_m))
+        for name, title in PLOTS
+    ]
     return rrb.Blueprint(
-        rrb.Vertical(
-            rrb.Horizontal(
-                rrb.Spatial2DView(origin=CAMERA, name="Camera", background=[0, 0, 0]),
-                rrb.Tabs(wide, near),
-                rrb.Vertical(
-                    rrb.TextDocumentView(origin="legend", name="What you see"),
-                    rrb.StateTimelineView(origin="status", name="Status"),
-                    rrb.TextLogView(origin="events", name="Events"),
-                    row_shares=[0.42, 0.28, 0.3],
-                ),
-                column_shares=[0.42, 0.36, 0.22],
-            ),
-            rrb.Grid(
-                *(rrb.TimeSeriesView(origin=f"plots/{name}", name=title) for name, title in plots), grid_columns=4
-            ),
-            row_shares=[0.54, 0.46],
-        ),
+        rrb.Vertical(above, rrb.Grid(*plots, grid_columns=4), row_shares=[0.51, 0.49]),
         rrb.TimePanel(state="collapsed", timeline="capture_time"),
         collapse_panels=True,
+    )
+
+
+def _scene_view(name: str, eye_m: Array, target_m: Array) -> rrb.Spatial3DView:
+    """Return a view of the scene from ``eye_m`` to ``target_m``, both (3,) in the port frame, paths drawn whole."""
+    past = [
+        rrb.VisibleTimeRange(
+            timeline, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
+        )
+        for timeline in ("frame", "capture_time")
+    ]
+    return rrb.Spatial3DView(
+        origin="scene",
+        contents=["$origin/**", f"- {OVERLAY}/**"],
+        name=name,
+        background=[18, 20, 26],
+        line_grid=False,
+        eye_controls=rrb.EyeControls3D(position=eye_m, look_target=target_m, eye_up=(0.0, 1.0, 0.0)),
+        overrides={path: rrb.archetypes.VisibleTimeRanges(past) for path in PATHS},
     )
 
 

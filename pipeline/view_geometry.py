@@ -6,6 +6,7 @@ state's tangent is (rho, theta, dv, domega) as the package docstring of ``schema
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,11 @@ SECTORS = 64
 """Facets around a body or a corridor."""
 LIFT = 0.004
 """How far a print stands off its body, as a fraction of the print's side: hides no part of it."""
+
+
+DASHES = 9
+"""Dashes to a side of a predicted square, each ``DASH_SHARE`` of its place."""
+DASH_SHARE = 0.55
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +139,12 @@ class PortMotion:
     closing_m_s: float
     closing_by: Array
 
+    def plotted(self) -> Iterator[tuple[str, float, float, Array]]:
+        """Give each quantity's name with the unit of its plot, the plot's units to an SI unit, value and derivative."""
+        yield "range_m", 1.0, self.range_m, self.range_by
+        yield "lateral_mm", 1e3, self.lateral_m, self.lateral_by
+        yield "closing_mm_s", 1e3, self.closing_m_s, self.closing_by
+
 
 def port_motion(
     T_chaser_target: Array, v_m_s: Array, omega_rad_s: Array, T_chaser_port: Array, T_target_port: Array
@@ -175,13 +187,12 @@ def chaser_pose(T_chaser_target: Array, T_target_port: Array) -> Array:
     return inverse(T_target_port) @ inverse(T_chaser_target)
 
 
-def dashed(corners_px: Array, dashes: int = 9) -> list[Array]:
-    """Return a closed polygon (N, 2) as short strips (2, 2), ``dashes`` to a side."""
-    starts = np.arange(dashes) / dashes
-    strips = []
-    for a, b in zip(corners_px, np.roll(corners_px, -1, axis=0), strict=True):
-        strips += [np.stack([a + t * (b - a), a + (t + 0.55 / dashes) * (b - a)]) for t in starts]
-    return strips
+def dashed(corners_px: Array) -> Array:
+    """Return a closed polygon (N, 2) as short strips (N * DASHES, 2, 2)."""
+    starts = np.arange(DASHES) / DASHES
+    along = np.stack([starts, starts + DASH_SHARE / DASHES], axis=1)
+    sides = np.roll(corners_px, -1, axis=0) - corners_px
+    return (corners_px[:, None, None] + along[None, :, :, None] * sides[:, None, None]).reshape(-1, 2, 2)
 
 
 def target_bodies(markers: list[tuple[Array, float, Surface]]) -> list[tuple[Array, Mesh]]:
