@@ -1,6 +1,6 @@
-"""The messages as a .proto file, for other languages: ``python -m schemas.proto`` writes ``schemas/proto/relnav.proto``.
+"""The messages as a .proto file for other languages; ``python -m schemas.proto`` writes it.
 
-The text is derived from the models like the descriptor, with their docstrings as comments.
+The text is derived from the models, like the descriptor, with their docstrings as comments.
 """
 
 from __future__ import annotations
