@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 
 import cv2
 import numpy as np
+from astratag.tracker import Tracker
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
@@ -16,9 +17,9 @@ from numpy.typing import NDArray
 import astratag.detection
 from astratag.camera import Camera
 from astratag.detector import Detector, MarkerSpec
-from astratag.tracker import Tracker
 from pipeline.convert import camera_from_calibration, detection_message
 from pipeline.mission import Mission
+from pipeline.opencv_log import quiet_opencv
 from schemas import Detections
 from schemas.codec import AnyMessage
 
@@ -31,10 +32,11 @@ FONT_PX = 16.0
 
 
 def decode_gray(data: bytes) -> NDArray[np.uint8]:
-    """Return a JPEG's or PNG's picture, uint8 gray (height, width).  Raises ValueError when it is damaged."""
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
+    """Return the picture in a JPEG, PNG or other image file, uint8 gray (height, width).  Raises ValueError when it is damaged."""
+    with quiet_opencv():
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
     if image is None:
-        raise ValueError(f"an image of {len(data)} bytes is not a whole JPEG or PNG: truncated, or another format?")
+        raise ValueError(f"{len(data)} bytes are not a whole image: truncated, or a format that OpenCV does not read?")
     return image
 
 
