@@ -8,10 +8,11 @@ saturates.  The sun is a direction, with one diffuse and one glossy reflection a
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -99,6 +100,42 @@ class Tube:
         return Hit(depth, x, (radius * np.arctan2(y, z)), normal, seen)
 
 
+@dataclass(frozen=True)
+class Box:
+    """A cuboid about its origin; its sides have no coordinates, so it is of one colour."""
+
+    half_x_m: float
+    half_y_m: float
+    half_z_m: float
+
+    def points(self) -> Array:
+        """Return the corners (8, 3)."""
+        return np.array(
+            list(itertools.product(*((-half, half) for half in (self.half_x_m, self.half_y_m, self.half_z_m))))
+        )
+
+    def hit(self, origin: Line, direction: Line) -> Hit:
+        """Return where rays enter the box."""
+        halves = (self.half_x_m, self.half_y_m, self.half_z_m)
+        middle = [np.asarray(-o / d) for o, d in zip(origin, direction, strict=True)]
+        reach = [np.abs(half / d) for half, d in zip(halves, direction, strict=True)]
+        enter = np.maximum(np.maximum(middle[0] - reach[0], middle[1] - reach[1]), middle[2] - reach[2])
+        leave = np.minimum(np.minimum(middle[0] + reach[0], middle[1] + reach[1]), middle[2] + reach[2])
+        x, y, z = (-np.sign(d) * (enter == m - r) for d, m, r in zip(direction, middle, reach, strict=True))
+        flat = np.zeros_like(enter)
+        return Hit(enter, flat, flat, (x, y, z), (enter < leave) & (enter > 0))
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What the rays of a window of pixels see of one body: ``won`` where it is the nearest."""
+
+    window: tuple[slice, slice]
+    hit: Hit
+    direction: Line
+    won: Mask
+
+
 @dataclass(frozen=True, eq=False)
 class Print:
     """A marker print laid flush on a body, its centre at the body's origin: x right, y up."""
@@ -119,6 +156,14 @@ class Material:
     sharpness: float = 40.0
     bump: Texture | None = None
     marker: Print | None = None
+
+    def normal(self, hit: Hit, footprint_m: float) -> Line:
+        """Return the surface's normal where rays meet it, bumps included."""
+        if self.bump is None:
+            return hit.normal
+        slopes = self.bump.read(hit.u_m, hit.v_m, footprint_m)
+        steep = 1 / np.sqrt(1 + slopes[..., 0] ** 2 + slopes[..., 1] ** 2)
+        return -slopes[..., 0] * steep, -slopes[..., 1] * steep, steep
 
     def read_albedo(self, u_m: Component, v_m: Component, footprint_m: float) -> Image:
         """Return the albedo (..., 3) at surface points."""
@@ -145,7 +190,7 @@ class Material:
 class Body:
     """A shape of one material, fixed in the scene."""
 
-    shape: Plate | Tube
+    shape: Plate | Tube | Box
     material: Material
     T_scene_body: Array
     casts_shadow: bool = False
@@ -175,83 +220,83 @@ class Scene:
         """Return the light (height, width, 3) that falls on the sensor during an exposure.
 
         ``poses_cam_scene`` are the scene's poses in the camera at as many instants, evenly spaced about mid-exposure:
-        each pixel sends one ray at each.
+        each pixel sends one ray at each.  Shadows are those of mid-exposure, to a pixel.
         """
         samples = len(poses_cam_scene)
+        sunlit = self._sunlit(camera, poses_cam_scene[samples // 2])
+        pixel = 1.0 / np.sqrt(camera.K[0, 0] * camera.K[1, 1] * samples)
         total = np.zeros_like(self.sky)
-        for (dx, dy), instant in zip(ray_lattice(samples), exposure_order(samples), strict=True):
-            total += self._sample(camera, poses_cam_scene[instant], float(dx), float(dy), samples)
+        for offset_px, instant in zip(ray_lattice(samples), exposure_order(samples), strict=True):
+            T_cam_scene, picture = poses_cam_scene[instant], self.sky.copy()
+            for index, sight in self._trace(camera, T_cam_scene, offset_px):
+                shade = self._shade(self.bodies[index], T_cam_scene, sight, sunlit[sight.window], pixel)
+                np.copyto(picture[sight.window], shade, where=sight.won[..., None])
+            total += picture
         return total / np.float32(samples)
 
-    def _sample(self, camera: Camera, T_cam_scene: Array, dx_px: float, dy_px: float, samples: int) -> Image:
-        """Return the light that one ray a pixel, at an offset from its centre, brings in."""
+    def _trace(self, camera: Camera, T_cam_scene: Array, offset_px: Array) -> Iterator[tuple[int, Sight]]:
+        """Yield each body with the pixels in which it is the nearest so far, one ray a pixel."""
         rays, right, down = pixel_rays(camera)
-        picture, nearest = self.sky.copy(), np.full(self.sky.shape[:2], np.inf, np.float32)
-        pixel = 1.0 / np.sqrt(camera.K[0, 0] * camera.K[1, 1] * samples)
-        for body in self.bodies:
+        nearest = np.full((camera.height, camera.width), np.inf, np.float32)
+        for index, body in enumerate(self.bodies):
             T_body_cam = inverse(T_cam_scene @ body.T_scene_body)
             window = window_of(camera, transform(inverse(T_body_cam), body.shape.points()))
             if window is None:
                 continue
-            ray = (rays[window] + dx_px * right[window] + dy_px * down[window]).astype(np.float32)
+            ray = (rays[window] + offset_px[0] * right[window] + offset_px[1] * down[window]).astype(np.float32)
             direction = _turn(T_body_cam[:3, :3], (ray[..., 0], ray[..., 1], 1.0))
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
                 hit = body.shape.hit(_floats(T_body_cam[:3, 3]), direction)
-                facing = -_dot(hit.normal, direction)
-                won = hit.seen & (facing > 0) & (hit.depth < nearest[window])
+                won = hit.seen & (hit.depth < nearest[window]) & (_dot(hit.normal, direction) < 0)
             if won.any():
                 hit = _only(hit, won)
-                footprint_m = float(np.median(hit.depth[won] / np.sqrt(facing[won]))) * pixel
-                np.copyto(
-                    picture[window], self._shade(body, T_cam_scene, hit, direction, footprint_m), where=won[..., None]
-                )
                 np.copyto(nearest[window], hit.depth, where=won)
-        return picture
+                yield index, Sight(window, hit, direction, won)
 
-    def _shade(self, body: Body, T_cam_scene: Array, hit: Hit, direction: Line, footprint_m: float) -> Image:
-        """Return the light that lit points of a body send back along the rays."""
-        material, T_scene_body = body.material, body.T_scene_body
-        R_cam_body = T_cam_scene[:3, :3] @ T_scene_body[:3, :3]
-        to_sun = _floats(R_cam_body.T @ self.sun.direction_cam)
-        normal = hit.normal
-        if material.bump is not None:
-            slopes = material.bump.read(hit.u_m, hit.v_m, footprint_m)
-            steep = 1 / np.sqrt(1 + slopes[..., 0] ** 2 + slopes[..., 1] ** 2)
-            normal = (-slopes[..., 0] * steep, -slopes[..., 1] * steep, steep)
+    def _shade(self, body: Body, T_cam_scene: Array, sight: Sight, sunlit: Component, pixel: float) -> Image:
+        """Return the light that a body sends back along the rays that meet it."""
+        material, hit, direction = body.material, sight.hit, sight.direction
+        facing = np.maximum(-_dot(hit.normal, direction), 1e-6)
+        footprint_m = float(np.median((hit.depth / np.sqrt(facing))[sight.won])) * pixel
+        to_sun = _floats((T_cam_scene[:3, :3] @ body.T_scene_body[:3, :3]).T @ self.sun.direction_cam)
+        normal = material.normal(hit, footprint_m)
         towards_sun = _dot(normal, to_sun)
-        lit = np.clip(towards_sun, 0, 1)
-        shadow = self._shadow(body, T_cam_scene, hit, direction, to_sun, lit > 0)
+        sunlit = sunlit * np.float32(self.sun.irradiance) * (towards_sun > 0)
         # Blinn's halfway vector between the sun and the eye, without forming it.
         length = np.sqrt(_dot(direction, direction))
-        towards_eye = -_dot(normal, direction) / length
-        between = -_dot(to_sun, direction) / length
+        towards_eye, between = -_dot(normal, direction) / length, -_dot(to_sun, direction) / length
         halfway = np.clip((towards_sun + towards_eye) / np.sqrt(np.maximum(2 + 2 * between, 1e-6)), 0, 1)
-        gloss = material.gloss * halfway**material.sharpness * (towards_sun > 0) * shadow * self.sun.irradiance
+        gloss = material.gloss * halfway**material.sharpness * sunlit
         albedo = material.read_albedo(hit.u_m, hit.v_m, footprint_m)
-        diffuse = (lit * shadow * self.sun.irradiance)[..., None] + np.array(self.sun.ambient, np.float32)
+        diffuse = (towards_sun * sunlit)[..., None] + np.array(self.sun.ambient, np.float32)
         return (albedo * diffuse + gloss[..., None]).astype(np.float32)
 
-    def _shadow(self, body: Body, T_cam_scene: Array, hit: Hit, direction: Line, to_sun: Line, lit: Mask) -> Component:
-        """Return 1 where the sun reaches a body and 0 in the shadow of another."""
-        light = np.ones(hit.depth.shape, np.float32)
-        o_body = _floats(inverse(T_cam_scene @ body.T_scene_body)[:3, 3])
+    def _sunlit(self, camera: Camera, T_cam_scene: Array) -> Component:
+        """Return the picture (height, width) of what the sun reaches, 1, and of hard shadows, 0."""
+        winner = np.full((camera.height, camera.width), -1, np.int16)
+        depth = np.zeros((camera.height, camera.width), np.float32)
+        for index, sight in self._trace(camera, T_cam_scene, np.zeros(2)):
+            np.copyto(winner[sight.window], index, where=sight.won)
+            np.copyto(depth[sight.window], sight.hit.depth, where=sight.won)
         sun_scene = T_cam_scene[:3, :3].T @ self.sun.direction_cam
-        for caster in self.bodies:
-            if not caster.casts_shadow or caster is body or not _may_shade(caster, body, sun_scene):
-                continue
-            where = np.nonzero(lit & (light > 0))
-            T_caster_body = inverse(caster.T_scene_body) @ body.T_scene_body
-            points = tuple(
-                o + hit.depth[where] * np.broadcast_to(d, lit.shape)[where]
-                for o, d in zip(o_body, direction, strict=True)
-            )
-            start = tuple(
-                p + float(t) for p, t in zip(_turn(T_caster_body[:3, :3], points), T_caster_body[:3, 3], strict=True)
-            )
-            along = _turn(T_caster_body[:3, :3], to_sun)
-            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-                met = caster.shape.hit(start, along)
-                light[where] = ~(met.seen & (met.depth > SHADOW_GAP_M))
+        light, rays = np.ones_like(depth), pixel_rays(camera)[0]
+        for index in np.unique(winner[winner >= 0]).tolist():
+            body = self.bodies[index]
+            casters = [c for c in self.bodies if c.casts_shadow and c is not body and _may_shade(c, body, sun_scene)]
+            where = np.nonzero(winner == index)
+            far = depth[where]
+            point = (rays[(*where, 0)].astype(np.float32) * far, rays[(*where, 1)].astype(np.float32) * far, far)
+            free = np.ones(far.shape, bool)
+            for caster in casters:
+                T_caster_cam = inverse(T_cam_scene @ caster.T_scene_body)
+                turned = _turn(T_caster_cam[:3, :3], point)
+                start = tuple(p + float(t) for p, t in zip(turned, T_caster_cam[:3, 3], strict=True))
+                with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                    met = caster.shape.hit(start, _floats(T_caster_cam[:3, :3] @ self.sun.direction_cam))
+                free &= ~(met.seen & (met.depth > SHADOW_GAP_M))
+            light[where] = free
+        # A body that covers only part of a pixel borrows the light of its neighbour.
+        np.copyto(light, cv2.erode(light, np.ones((3, 3), np.uint8)), where=winner < 0)
         return light
 
 
