@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,9 +56,12 @@ class Columns:
     latency_s: Array
 
 
-def write_report(run_path: str | Path, summary: Summary, out_png: str | Path) -> None:
-    """Draw the run recorded in ``run_path``.  Raises RecordingError (a ValueError) when it cannot be read."""
-    draw_report(load_run(run_path), summary).savefig(out_png)
+def write_report(run_path: str | Path, summary: Summary, out_png: str | Path, *, parts: Sequence[Path] = ()) -> None:
+    """Draw the run recorded in ``run_path``, and in further ``parts`` when the recorder was started again.
+
+    Raises RecordingError (a ValueError) when one cannot be read.
+    """
+    draw_report(load_run(run_path, *parts), summary).savefig(out_png)
 
 
 def draw_report(run: Run, summary: Summary) -> Figure:
