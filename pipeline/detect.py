@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 from astratag.annotate import annotate
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from numpy.typing import NDArray
 
 from astratag.camera import Camera
@@ -28,7 +29,7 @@ from pipeline.opencv_log import quiet_opencv
 from pipeline.picture_sources import IMAGE_SUFFIXES
 from pipeline.recording import Recording
 from pipeline.sources import natural_order
-from schemas import Envelope
+from schemas import Envelope, decode
 from schemas.topics import FRAME
 
 Gray = NDArray[np.uint8]
@@ -219,7 +220,7 @@ def _recording_pictures(
 
 
 def _read_frame(envelope: Envelope) -> Gray:
-    return decode_gray(envelope.message().data)
+    return decode_gray(decode(CompressedImage, envelope.payload).data)
 
 
 def _write_annotated(folder: Path, stem: str, image: Gray, detections: Sequence[Detection]) -> None:

@@ -205,8 +205,8 @@ def _row(sequence: int, parts: _Parts, mission: Mission, start_ns: int) -> Row:
 
 
 def state_error(truth: Truth, state: RelativeState) -> Array | None:
-    """Return truth minus estimate (12,), as in ``Row.error``; None when the state has no pose."""
-    if state.T_chaser_target is None:
+    """Return truth minus estimate (12,), as in ``Row.error``; None without a pose, or when it is of another time."""
+    if state.T_chaser_target is None or state.t_capture_ns != truth.t_capture_ns:
         return None
     pose_error = difference(pose_matrix(truth.T_chaser_target), pose_matrix(state.T_chaser_target))
     if state.v_chaser_target_m_s is None or state.omega_chaser_target_in_target_rad_s is None:

@@ -11,7 +11,7 @@ from rich.console import Console
 from astratag.transforms import perturb
 from pipeline.expected import visible_layers
 from pipeline.recording import RecordingWriter
-from pipeline.run import Run, gather_run
+from pipeline.run import Run, gather_run, state_error
 from pipeline.scoring import print_table, score, score_run, seconds_by_mode, write_summary
 from schemas import Detection, Mode
 from schemas.topics import FRAME, STATE
@@ -66,6 +66,14 @@ def test_only_states_that_claim_to_be_right_are_scored():
     assert summary.states_wrong == 20
     assert summary.modes == pytest.approx({mode.name: 1.0 for mode in Mode})
     assert [event.text for event in summary.events] == [f"mode {mode.name}" for mode in modes]
+
+
+def test_a_state_is_judged_by_truth_of_its_own_time():
+    """The filter answers a late frame with the state that it has already: that is no error."""
+    run = run_of(frames=3)
+    state, truth = run.rows[1].state, run.rows[2].truth
+    assert state is not None and truth is not None
+    assert state_error(truth, state) is None
 
 
 def test_a_mode_lasts_until_the_next_state():
