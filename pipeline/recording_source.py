@@ -116,9 +116,9 @@ def _frame_key(recording: Recording, mission: Mission) -> str:
     if wanted in keys:
         return wanted
     if not keys:
-        found = ", ".join([*recording.topics(), *recording.ignored]) or "no messages"
+        found = ", ".join([*recording.topics(), *recording.ignored]) or "no topic"
         raise RecordingError(
-            f"{recording.path} has no camera frames: expected {wanted} or one topic of images; {found}"
+            f"{recording.path} has no camera frames: expected {wanted} or one topic of foxglove images, found {found}"
         )
     if len(keys) > 1:
         raise RecordingError(f"{recording.path} has several cameras ({', '.join(keys)}): name one in the mission")
