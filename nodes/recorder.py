@@ -9,7 +9,7 @@ from pathlib import Path
 from nodes.bus import Received
 from nodes.shell import NodeError
 from pipeline.mission import Mission
-from pipeline.recording import RecordingError, RecordingWriter, recover
+from pipeline.recording import Recording, RecordingError, RecordingWriter, recover
 from schemas import Envelope
 
 FLUSH_PERIOD_NS = 250_000_000
@@ -18,17 +18,13 @@ FLUSH_PERIOD_NS = 250_000_000
 class RecorderWork:
     """Writes; never over a recording that is there.
 
-    A recorder that is started again makes the part that was cut off whole, in its place, and goes on in the
-    next: ``run.mcap``, ``run.1.mcap``, ``run.2.mcap``.
+    A recorder that is started again goes on in the next part, ``run.1.mcap`` after ``run.mcap``; ``join_parts``
+    makes one recording of them when the run is over.
     """
 
     def __init__(self, directory: Path, mission: Mission) -> None:
         directory.mkdir(parents=True, exist_ok=True)
-        parts = existing_parts(directory)
-        if parts:
-            with contextlib.suppress(RecordingError):  # killed before its first message
-                recover(parts[-1], parts[-1])
-        self._writer = RecordingWriter(_part(directory, len(parts)), mission)
+        self._writer = RecordingWriter(_part(directory, len(existing_parts(directory))), mission)
         self._flushed_ns = 0
 
     def handle(self, received: Received) -> Iterable[Envelope]:
@@ -60,6 +56,28 @@ def existing_parts(directory: Path) -> list[Path]:
     while (part := _part(directory, len(parts))).exists():
         parts.append(part)
     return parts
+
+
+def join_parts(directory: Path, mission: Mission) -> Path:
+    """Make one whole ``run.mcap`` of a run's parts and return its path.  Raises RecordingError when there is none."""
+    whole = []
+    parts = existing_parts(directory)
+    for part in parts:
+        with contextlib.suppress(RecordingError):  # killed before its first message
+            recover(part, part)
+            whole.append(part)
+    if not whole:
+        raise RecordingError(f"the run left no recording in {directory}")
+    if len(parts) > 1:
+        joined = directory / "run.joined.mcap"
+        with RecordingWriter(joined, mission) as writer:
+            for part in whole:
+                for envelope, t_receipt_ns in Recording(part).envelopes():
+                    writer.write(envelope, t_receipt_ns)
+        joined.replace(parts[0])
+        for part in parts[1:]:
+            part.unlink()
+    return parts[0]
 
 
 def _part(directory: Path, number: int) -> Path:

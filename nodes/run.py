@@ -19,8 +19,8 @@ from nodes.bus import Link, free_endpoint
 from nodes.cli import EXIT_INTERRUPTED
 from nodes.processes import PROCESSES
 from nodes.progress import RunProgress
-from nodes.recorder import existing_parts
-from nodes.supervisor import Hooks, Plan, RunError, Supervisor
+from nodes.recorder import existing_parts, join_parts
+from nodes.supervisor import Hooks, Outcome, Plan, RunError, Supervisor
 from pipeline.mission import Mission
 from pipeline.sources import Source, open_source
 
@@ -53,7 +53,7 @@ def replay(args: argparse.Namespace) -> int:
     _prepare(args.out)
     _print_header(console, subject, args, view, f"speed {'max' if math.isinf(speed) else f'{speed:g}'}")
     if args.direct:
-        done = _run_direct(args, source, view, speed, console)
+        outcome = _run_direct(args, source, view, speed, console)
     else:
         del source
         own_link, node_link = _links(args.connect, free_endpoint())
@@ -68,9 +68,9 @@ def replay(args: argparse.Namespace) -> int:
                 lossless=True,
                 mission_path=mission_path,
             )
-            done = _run(plan, subject.frame_count, console)
-    _finish(args.out, console)
-    if not done:
+            outcome = _run(plan, subject.frame_count, console)
+    _finish(args.out, subject.mission, outcome, console)
+    if not outcome.completed:
         print("relnav: error: interrupted; what was recorded until then is kept", file=sys.stderr)
         return EXIT_INTERRUPTED
     return 0
@@ -99,10 +99,10 @@ def live(args: argparse.Namespace) -> int:
             mission_path=mission_path,
             duration_s=args.duration,
         )
-        done = _run(plan, None if args.loop or args.duration else subject.frame_count, console)
-    _finish(args.out, console)
-    endless = subject.live and args.duration is None  # a camera's run ends no other way
-    return 0 if done or endless else EXIT_INTERRUPTED
+        outcome = _run(plan, None if args.loop or args.duration else subject.frame_count, console)
+    _finish(args.out, subject.mission, outcome, console)
+    endless = (subject.live or args.loop) and args.duration is None  # ends no other way
+    return 0 if outcome.completed or endless else EXIT_INTERRUPTED
 
 
 def _console() -> Console:
@@ -209,12 +209,12 @@ def _print_header(console: Console, subject: Subject, args: argparse.Namespace, 
         console.print(f"warning: {warning}", style="yellow")
 
 
-def _run(plan: Plan, frame_count: int | None, console: Console) -> bool:
+def _run(plan: Plan, frame_count: int | None, console: Console) -> Outcome:
     with RunProgress(console, frame_count) as progress:
         return Supervisor(plan, Hooks(progress.on_state, progress.on_note)).run()
 
 
-def _run_direct(args: argparse.Namespace, source: Source, view: View, speed: float, console: Console) -> bool:
+def _run_direct(args: argparse.Namespace, source: Source, view: View, speed: float, console: Console) -> Outcome:
     from pipeline.recording import RecordingWriter
     from pipeline.replay import replay_direct
     from pipeline.view import Viewer
@@ -234,26 +234,35 @@ def _run_direct(args: argparse.Namespace, source: Source, view: View, speed: flo
         try:
             replay_direct(source, [recorder, viewer], speed="max" if math.isinf(speed) else speed)
         except KeyboardInterrupt:
-            return False
-    return True
+            return Outcome(completed=False, died=frozenset())
+    return Outcome(completed=True, died=frozenset())
 
 
-def _finish(out: Path, console: Console) -> None:
-    """Score the run, write summary and report, print the table and what to try next."""
+def _finish(out: Path, mission: Mission, outcome: Outcome, console: Console) -> None:
+    """Make recording and .rrd whole, score the run, write summary and report, print the table and what to try next."""
     from pipeline.report import write_report
     from pipeline.scoring import print_table, score, write_summary
 
-    parts = existing_parts(out)
-    if not parts:
-        raise RunError(f"the run left no recording in {out}")
+    recording = join_parts(out, mission)
+    if "viewer" in outcome.died:
+        _draw_again(recording, out / "run.rrd")
     try:
-        summary = score(parts[0])
+        summary = score(recording)
     except ValueError as error:
         raise RunError(f"the run cannot be scored: {error}") from error
     write_summary(summary, out / "summary.json")
-    write_report(parts[0], summary, out / "report.png")
+    write_report(recording, summary, out / "report.png")
     print_table(summary, console)
-    if len(parts) > 1:
-        console.print(f"the recorder was started again: the recording goes on in {', '.join(map(str, parts[1:]))}")
-    console.print(f"written: {parts[0]}, {out / 'run.rrd'}, {out / 'summary.json'}, {out / 'report.png'}")
+    console.print(f"written: {recording}, {out / 'run.rrd'}, {out / 'summary.json'}, {out / 'report.png'}")
     console.print(f"try next: [bold]{Path(sys.prefix, 'bin', 'rerun')} {out / 'run.rrd'}[/bold]")
+
+
+def _draw_again(recording: Path, rrd_path: Path) -> None:
+    """Write the .rrd from the recording: the viewer did not see all of the run."""
+    from pipeline.recording import Recording
+    from pipeline.view import Viewer
+
+    recorded = Recording(recording)
+    with Viewer(recorded.mission, rrd_path=rrd_path, mode="none") as viewer:
+        for envelope, t_receipt_ns in recorded.envelopes():
+            viewer.write(envelope, t_receipt_ns)

@@ -61,6 +61,16 @@ class Hooks:
     on_note: Callable[[str], None] = lambda note: None
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """How a run went."""
+
+    completed: bool
+    """False when the user stopped it."""
+    died: frozenset[str]
+    """Names of the nodes that died at least once."""
+
+
 @dataclass
 class Child:
     """One running node."""
@@ -93,11 +103,11 @@ class Supervisor:
         self._interrupted = threading.Event()
         self._last_frame: Stamp | None = None
         self._live_since_s: float | None = None
-        self._missed: set[str] = set()
+        self._died: set[str] = set()
         self._excuse_due_s = 0.0
 
-    def run(self) -> bool:
-        """Run to the end and return True, or False when the user stopped it.  Raises RunError and BusError."""
+    def run(self) -> Outcome:
+        """Run to the end, or until the user stops it.  Raises RunError and BusError."""
         plan = self._plan
         previous = {number: signal.signal(number, self._interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
@@ -116,7 +126,7 @@ class Supervisor:
         finally:
             for number, handler in previous.items():
                 signal.signal(number, handler)
-        return not self._interrupted.is_set()
+        return Outcome(completed=not self._interrupted.is_set(), died=frozenset(self._died))
 
     def pid(self, name: str) -> int | None:
         """Return a node's process id, None when it is not running."""
@@ -193,13 +203,13 @@ class Supervisor:
     def _mourn(self, child: Child) -> None:
         name, now_s = child.process.name, time.monotonic()
         del self._children[name]
+        self._died.add(name)
         _join_pipes(child)
         why = child.epitaph()
         if self._plan.lossless:
             if child.process.required:
                 raise RunError(f"{name}: {why}" if child.popen.returncode > 0 else f"the {name} died: {why}")
             self._hooks.on_note(f"warning: the {name} died ({why}); the run goes on without it")
-            self._missed.add(name)
             return
         self._restarts[name] = [t for t in self._restarts[name] if now_s - t < RESTART_MEMORY_S] + [now_s]
         hopeless = len(self._restarts[name]) > MOST_RESTARTS or (not child.alive and child.popen.returncode > 0)
@@ -213,9 +223,11 @@ class Supervisor:
 
     def _excuse_missed(self, bus: Bus) -> None:
         """Say until the source starts, to nodes that may still be coming up, for whom not to wait."""
-        if self._missed and self._live_since_s is None and time.monotonic() >= self._excuse_due_s:
+        if not self._plan.lossless or self._live_since_s is not None:
+            return
+        if self._died and time.monotonic() >= self._excuse_due_s:
             self._excuse_due_s = time.monotonic() + 0.2
-            for name in self._missed:
+            for name in self._died:
                 bus.send(Credit(name, ended=True))
 
     def _finished(self) -> bool:
