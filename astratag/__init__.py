@@ -5,6 +5,7 @@ from astratag.detection import Detection, LayerDetection, PlanarPose
 from astratag.detector import Detector, MarkerSpec
 from astratag.dictionary import Dictionary, load_dictionary
 from astratag.surface import Cylinder, Flat, Surface
+from astratag.tracker import Tracker
 
 __all__ = [
     "Camera",
@@ -17,5 +18,6 @@ __all__ = [
     "MarkerSpec",
     "PlanarPose",
     "Surface",
+    "Tracker",
     "load_dictionary",
 ]

@@ -8,7 +8,7 @@ through the fit and accept it or not; measure each layer's corners; find the pos
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 
 from astratag.camera import Camera
 from astratag.candidates import OUTER, PROMISING, Candidate, bent_candidates, flat_candidates
-from astratag.detection import Detection, LayerDetection
+from astratag.detection import Detection, LayerDetection, PlanarPose
 from astratag.dictionary import Dictionary, load_dictionary
 from astratag.edges import Transfer, inverse_transfer
 from astratag.fit import measure_layers
 from astratag.geometry import LAYERS, TEMPLATE_UNITS, layer_points, square
-from astratag.grow import Fit, fit_own_edges, grow
-from astratag.pose import as_planar, planar_poses, poses_from_square
+from astratag.grow import Fit, fit_own_edges, grow, layer_side_px, settle
+from astratag.pose import planar_poses, poses_from_square, refine_on_corners
 from astratag.search import find_quads
 from astratag.signature import ACCEPT, Artwork, Codebook, Reading, layer_cells
 from astratag.surface import Flat, Surface
@@ -32,10 +32,18 @@ from astratag.warp import BentWarp, FittedWarp, HomographyWarp, PoseWarp
 
 Array = NDArray[np.float64]
 
+HALVE_FROM_PX = 500_000
+"""Images with more pixels than this are searched at half resolution first."""
+SURE = 0.85
+"""Correlation from which a reading needs no second opinion."""
 LEAST_LIKENESS = 0.45
 """Correlation of the whole print with what is seen through a fit, below which it is something else."""
 CERTAIN_LIKENESS = 0.85
 """Likeness from which no other layer is tried."""
+OTHER_POSE_GAIN = 0.7
+"""The other planar pose is tried when it brings the corners' residual below this fraction."""
+NOTICEABLE_BEND = 0.02
+"""A print of unknown surface is called curved from this bend on, as a fraction of its side."""
 GRID_LINES = 9
 
 
@@ -91,8 +99,18 @@ class Detector:
 
         Raises ValueError for another kind of image, or a camera of another size.
         """
-        view = self.view(image, camera)
-        return self.search(view, find_quads(view.gray))
+        return self.find(self.view(image, camera))
+
+    def find(self, view: View) -> list[Detection]:
+        """Return the markers in a whole image, the surest first."""
+        large = view.gray.size > HALVE_FROM_PX
+        found, rest = self.search(view, find_quads(view.gray, halve=large))
+        if large and not found:
+            found, rest = self.search(view, find_quads(view.gray))
+        if not isinstance(self.default.surface, Flat) and all(seen.correlation < SURE for seen in found):
+            bent = self._confirm_all(view, bent_candidates(view.gray, rest, self._codebook, self._artwork))
+            found += bent
+        return surest(found)
 
     def view(self, image: NDArray[np.uint8], camera: Camera | None) -> View:
         """Return an image made ready.  Raises ValueError as ``detect`` does."""
@@ -105,18 +123,16 @@ class Detector:
         """Return how a marker was made."""
         return self.markers.get(marker_id, self.default)
 
-    def search(self, view: View, quads: Array) -> list[Detection]:
-        """Return the markers among rough quads (Q, 4, 2), each marker once."""
+    def search(self, view: View, quads: Array) -> tuple[list[Detection], list[Candidate]]:
+        """Return the markers among rough quads (Q, 4, 2), each once, and the quads that no sure marker explains."""
         promising, faint = flat_candidates(view.gray, quads, self._codebook)
-        found = self._confirm_all(view, promising, [])
-        if not isinstance(self.default.surface, Flat):
-            open_ones = [c for c in faint if not _inside_any(c.corners_px, found)]
-            found = self._confirm_all(view, bent_candidates(view.gray, open_ones, self._codebook, self._artwork), found)
-        return sorted(found, key=lambda d: -d.correlation)
+        found = self._confirm_all(view, promising)
+        sure = [seen for seen in found if seen.correlation >= SURE]
+        return found, [c for c in promising + faint if not _inside_any(c.corners_px, sure)]
 
-    def _confirm_all(self, view: View, candidates: Sequence[Candidate], found: list[Detection]) -> list[Detection]:
-        """Return what was found before and the markers among more candidates, each marker once."""
-        found = list(found)
+    def _confirm_all(self, view: View, candidates: Sequence[Candidate]) -> list[Detection]:
+        """Return the markers among candidates, each once."""
+        found: list[Detection] = []
         for candidate in candidates:
             if not _inside_any(candidate.corners_px, found):
                 detection = self._confirm(view, candidate)
@@ -130,17 +146,48 @@ class Detector:
         guesses = self._artwork.layer_scores(view.gray, candidate.warp, marker_id)
         best: tuple[float, Fit | None] = (LEAST_LIKENESS, None)
         for layer in np.argsort(-guesses).tolist():
-            for start in self._starts(view, candidate, layer):
-                fit = self._fit(view, start, layer, marker_id)
-                if fit is not None:
-                    likeness = self._artwork.likeness(view.gray, fit.warp, marker_id)
-                    best = max(best, (likeness, fit), key=lambda pair: pair[0])
+            fit = self._fit(view, candidate, layer)
+            if fit is not None:
+                likeness = self._artwork.likeness(view.gray, fit.warp, marker_id)
+                best = max(best, (likeness, fit), key=lambda pair: pair[0])
             if best[0] > CERTAIN_LIKENESS:
                 break
-        if best[1] is None:
+        likeness, fit = best
+        if fit is None:
             return None
-        flat = "cylinder" if isinstance(best[1].warp, PoseWarp) and best[1].warp.curved else "planar"
-        return self.describe(view, marker_id, best[1], "tps" if candidate.bent else flat)
+        if isinstance(fit.warp, PoseWarp):
+            method = "cylinder" if fit.warp.curved else "planar"
+        else:
+            method = "tps" if candidate.bent or _bend_fraction(fit.warp) > NOTICEABLE_BEND else "planar"
+        return self.describe(view, marker_id, fit, method)
+
+    def _fit(self, view: View, candidate: Candidate, layer: int) -> Fit | None:
+        """Return the fit of a whole marker begun at one layer, None as soon as its code is not read there."""
+        marker_id = candidate.reading.marker_id
+        starts = list(self._starts(view, candidate, layer))
+        if candidate.bent and starts and isinstance(starts[0], BentWarp):
+            return grow(view.light, starts[0], layer)
+        own = (fit_own_edges(view.light, start, layer) for start in starts)
+        begun = min((fit for fit in own if fit is not None), key=lambda fit: fit.cost, default=None)
+        if begun is None:
+            return None
+        cells = layer_cells(view.gray, begun.warp, layer)
+        if self._codebook.read_as(cells, marker_id).correlation < PROMISING:
+            return None
+        fit = grow(view.light, begun.warp, layer)
+        return fit if fit is None else self._other_pose(view, fit)
+
+    def _other_pose(self, view: View, fit: Fit) -> Fit:
+        """Return the fit begun again from the other of two planar poses when that explains the corners better."""
+        warp = fit.warp
+        layers = measure_layers(fit, view.gray.shape)
+        if not isinstance(warp, PoseWarp) or not layers:
+            return fit
+        poses = planar_poses(warp.camera, layers, warp.side_m, warp.surface)
+        if not poses or poses[0].reprojection_rms_px > OTHER_POSE_GAIN * _corner_rms(warp, layers):
+            return fit
+        again = settle(view.light, replace(warp, T_cam_marker=poses[0].T_cam_marker))
+        return again if again is not None and again.cost < fit.cost else fit
 
     def _starts(self, view: View, candidate: Candidate, layer: int) -> Iterator[FittedWarp]:
         """Yield warps to start fitting from when the candidate is ``layer`` of its marker."""
@@ -154,16 +201,6 @@ class Detector:
         else:
             yield HomographyWarp.from_points(template, candidate.corners_px)
 
-    def _fit(self, view: View, start: FittedWarp, layer: int, marker_id: int) -> Fit | None:
-        """Return the fit of a whole marker begun at one layer, None as soon as its code is not read there."""
-        warp = start if isinstance(start, BentWarp) else fit_own_edges(view.light, start, layer)
-        if warp is None:
-            return None
-        cells = layer_cells(view.gray, warp, layer)
-        if self._codebook.read_as(cells, marker_id).correlation < PROMISING:
-            return None
-        return grow(view.light, warp, layer)
-
     def describe(self, view: View, marker_id: int, fit: Fit, method: str) -> Detection | None:
         """Return the detection a fit amounts to, None when the code read through it is not the marker's."""
         reading = self._read_through(view, fit.warp, marker_id)
@@ -173,15 +210,16 @@ class Detector:
         spec, warp = self.spec(marker_id), fit.warp
         curved = method == "tps" or (isinstance(warp, PoseWarp) and warp.curved)
         T_cam_marker = covariance = rms_px = None
-        poses: Sequence = ()
+        poses: tuple[PlanarPose, ...] = ()
         if view.camera is not None:
-            poses = planar_poses(view.camera, layers, spec.side_m, spec.surface or Flat())
+            surface = spec.surface or Flat()
+            poses = planar_poses(view.camera, layers, spec.side_m, surface)
             if isinstance(warp, PoseWarp):
                 T_cam_marker, covariance = warp.T_cam_marker, fit.covariance
-                rms_px = _corner_rms(warp, layers)
+                rms_px = _corner_rms(warp, layers) if layers else None
             elif poses:
-                T_cam_marker, covariance = poses[0].T_cam_marker, poses[0].covariance
-                rms_px = poses[0].reprojection_rms_px
+                start = PoseWarp(view.camera, spec.side_m, surface, poses[0].T_cam_marker)
+                T_cam_marker, covariance, rms_px = refine_on_corners(start, layers)
         return Detection(
             family=self.dictionary.family,
             marker_id=marker_id,
@@ -190,7 +228,7 @@ class Detector:
             correlation=reading.correlation,
             hamming=reading.hamming,
             method=method,
-            planar_poses=as_planar(poses),
+            planar_poses=poses,
             T_cam_marker=T_cam_marker,
             covariance=covariance,
             reprojection_rms_px=rms_px,
@@ -207,6 +245,11 @@ class Detector:
                 continue
             readings.append(self._codebook.read_as(layer_cells(view.gray, warp, layer.index), marker_id))
         return max(readings, key=lambda r: r.correlation, default=None)
+
+
+def _bend_fraction(warp: FittedWarp) -> float:
+    """Return how far a print is bent, as a fraction of its side."""
+    return float(np.abs(warp.bend).max()) / layer_side_px(warp, 0) if isinstance(warp, BentWarp) else 0.0
 
 
 def as_gray(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -229,12 +272,19 @@ def warp_grid(warp: FittedWarp) -> Array:
     return warp(np.stack(np.meshgrid(span, span), axis=-1))
 
 
-def _corner_rms(warp: PoseWarp, layers: Sequence[LayerDetection]) -> float | None:
+def _corner_rms(warp: PoseWarp, layers: Sequence[LayerDetection]) -> float:
     """Return the root mean square distance in pixels of the measured corners from where the pose puts them."""
-    if not layers:
-        return None
     errors = np.concatenate([warp(square(*LAYERS[seen.layer].black)) - seen.corners_px for seen in layers])
     return float(np.sqrt((errors**2).sum(axis=1).mean()))
+
+
+def surest(found: Sequence[Detection], first: Sequence[Detection] = ()) -> list[Detection]:
+    """Return ``first`` and the detections that overlap neither these nor a surer one, the surest first."""
+    kept = list(first)
+    for seen in sorted(found, key=lambda seen: -seen.correlation):
+        if not _inside_any(seen.corners_px, kept):
+            kept.append(seen)
+    return sorted(kept, key=lambda seen: -seen.correlation)
 
 
 def _inside_any(corners_px: Array, found: Sequence[Detection]) -> bool:

@@ -73,7 +73,12 @@ EDGE_POINTS = _STARTS[:, None, :] + ALONG[None, :, None] * (_ENDS - _STARTS)[:, 
 EDGE_LAYER = np.array([e.layer for e in EDGES])
 EDGE_IS_FRAME = np.array([e.frame for e in EDGES])
 EDGE_REACH = np.array([e.reach for e in EDGES])
-EDGE_LENGTH = np.linalg.norm(_ENDS - _STARTS, axis=1)
+_FEW = np.array([0, POINTS_PER_EDGE // 2, POINTS_PER_EDGE - 1])
+_OUTWARDS = np.array([(0.0, -1.0), (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0)])[[e.side for e in EDGES]][:, None, :]
+_INWARDS = EDGE_POINTS[:, _FEW] - _OUTWARDS
+"""A few of the points of each edge, one unit further in."""
+LEAST_RISE, LEAST_RISE_GREY = 0.35, 0.05
+"""How steep a rise must be: a fraction of what is typical of its own edge, and in linear grey values a pixel."""
 
 
 def inverse_transfer(transfer: Transfer) -> NDArray[np.float32]:
@@ -119,45 +124,33 @@ def locate(light: NDArray[np.float32], warp: FittedWarp, edges: NDArray[np.int64
     """
     template = EDGE_POINTS[edges]
     predicted = warp(template)
-    tangent = np.gradient(predicted, axis=1)
-    spacing = np.linalg.norm(tangent, axis=2)
+    tangent = np.empty_like(predicted)
+    tangent[:, 1:-1] = (predicted[:, 2:] - predicted[:, :-2]) / 2
+    tangent[:, 0], tangent[:, -1] = predicted[:, 1] - predicted[:, 0], predicted[:, -1] - predicted[:, -2]
+    spacing = np.maximum(np.hypot(tangent[..., 0], tangent[..., 1]), 1e-9)
     length_px = spacing.mean(axis=1) * (POINTS_PER_EDGE - 1) / (1 - 2 * END_MARGIN)
-    outward = np.stack([tangent[..., 1], -tangent[..., 0]], axis=2) / np.maximum(spacing, 1e-9)[..., None]
-    normal = np.where(EDGE_IS_FRAME[edges, None, None], -outward, outward)
-    inward_units = template + np.where(EDGE_IS_FRAME[edges], 1.0, -1.0)[:, None, None] * _template_outward(edges)
-    # pixels a template unit spans across the edge: small where the print is seen at a slant
-    across = np.abs(((warp(inward_units) - predicted) * normal).sum(axis=2))
-    reach_px = (EDGE_REACH[edges, None] * across).min(axis=1)
+    to_paper = np.where(EDGE_IS_FRAME[edges], -1.0, 1.0)[:, None, None]
+    normal = np.stack([tangent[..., 1], -tangent[..., 0]], axis=2) / spacing[..., None] * to_paper
+    # how far apart neighbouring edges look, where that is least: small when the print is seen at a slant
+    across = (warp(_INWARDS[edges]) - predicted[:, _FEW]) * normal[:, _FEW]
+    reach_px = EDGE_REACH[edges] * np.abs(across.sum(axis=2)).min(axis=1)
 
     half = int(np.ceil((search_px + 3 * SMOOTHING_PX) / STEP_PX))
-    steps = np.arange(-half, half + 1) * STEP_PX
-    at = predicted[:, :, None, :] + steps[None, None, :, None] * normal[:, :, None, :]
+    steps = np.arange(-half, half + 1, dtype=np.float32) * STEP_PX
+    at = np.clip(predicted, -1e4, 1e4).astype(np.float32)[:, :, None, :]
+    at = at + steps[:, None] * normal.astype(np.float32)[:, :, None, :]
     height, width = light.shape
     ends = at[:, :, [0, -1], :]
     inside = ((ends >= 0) & (ends <= (width - 1, height - 1))).all(axis=(2, 3))
     profile = cv2.remap(
-        light,
-        np.clip(at, -1e4, 1e4).astype(np.float32).reshape(-1, len(steps), 2),
-        None,
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
+        light, at.reshape(-1, len(steps), 2), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     ).reshape(at.shape[:3])
     offset, rise = _steepest_rise(profile, np.minimum(search_px, 0.6 * reach_px))
     visible = warp.visible(template.reshape(-1, 2)).reshape(template.shape[:2])
     in_view = inside & visible
-    found = in_view & np.isfinite(offset) & (rise > _least_rise(rise))
+    typical = np.maximum(rise, 0.0).mean(axis=1, keepdims=True)
+    found = in_view & np.isfinite(offset) & (rise > np.maximum(LEAST_RISE * typical, LEAST_RISE_GREY))
     return EdgePoints(edges, predicted, normal, np.where(found, offset, 0.0), found, in_view, length_px, reach_px)
-
-
-def _template_outward(edges: NDArray[np.int64]) -> Array:
-    """Return the outward unit normals (E, 1, 2) of edges in the template."""
-    return np.array([(0.0, -1.0), (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0)])[[EDGES[e].side for e in edges]][:, None, :]
-
-
-def _least_rise(rise: Array) -> Array:
-    """Return how steep (E, 1) a rise must be: a fraction of what is typical of its own edge."""
-    typical = np.nanmedian(np.where(np.isfinite(rise), rise, 0.0), axis=1, keepdims=True)
-    return np.maximum(0.35 * typical, 0.05)
 
 
 def _derivative_filter(samples: int) -> Array:

@@ -32,7 +32,7 @@ CORNER_FLOOR_PX = 0.02
 TUKEY = 4.685
 """Residuals beyond this many standard deviations weigh nothing (95 % efficiency on Gaussian noise)."""
 REWEIGHTINGS = 4
-SHARP_REACH_PX, LEAST_REACH_PX = 3.2, 1.2
+SHARP_REACH_PX, LEAST_REACH_PX = 4.5, 1.2
 """An edge this far from its neighbours is sharp; nearer, they pull, and below the least it is no edge of its own."""
 LEAST_FOUND = 0.4
 """Fraction of an edge's points that must be found for it to count."""
@@ -59,14 +59,19 @@ class EdgeFit(Generic[W]):
     cost: float
 
 
-def fit_edges(light: NDArray[np.float32], warp: W, edges: NDArray[np.int64], search_px: float) -> EdgeFit[W] | None:
-    """Return ``warp`` moved by one Gauss-Newton step onto the edges seen near it; None when too few are seen."""
+def fit_edges(
+    light: NDArray[np.float32], warp: W, edges: NDArray[np.int64], search_px: float, *, sharp_only: bool = False
+) -> EdgeFit[W] | None:
+    """Return ``warp`` moved by one Gauss-Newton step onto the edges seen near it; None when too few are seen.
+
+    ``sharp_only`` leaves out edges that near neighbours pull: right for the last step, not for finding the way.
+    """
     seen = locate(light, warp, edges, search_px)
-    use = _usable(seen)
-    if len({EDGES[e].side for e in seen.edge[use.any(axis=1)]}) < 4:
+    use = _usable(seen, sharp_only)
+    if len(set((seen.edge[use.any(axis=1)] % 4).tolist())) < 4:  # edges come in fours: sides of a square
         return None
     template = EDGE_POINTS[seen.edge][use]
-    by_warp = np.einsum("nk,nkp->np", seen.normal[use], warp.jacobian(template))
+    by_warp = (seen.normal[use][:, None, :] @ warp.jacobian(template))[:, 0]
     A = np.column_stack([by_warp, np.ones(len(by_warp))])
     share = np.broadcast_to(_independent_share(seen)[:, None], use.shape)[use]
     delta, weight, sigma_px, covariance = _robust_least_squares(
@@ -82,9 +87,15 @@ def fit_edges(light: NDArray[np.float32], warp: W, edges: NDArray[np.int64], sea
     )
 
 
-def _usable(seen: EdgePoints) -> NDArray[np.bool_]:
-    """Return which points (E, M) to use: those of edges mostly found and not too near their neighbours."""
+def _usable(seen: EdgePoints, sharp_only: bool) -> NDArray[np.bool_]:
+    """Return which points (E, M) to use: those of edges mostly found and not too near their neighbours.
+
+    With ``sharp_only``, those that neighbours do not pull at all, if there is a square of them.
+    """
     mostly = seen.found.mean(axis=1) >= LEAST_FOUND * np.maximum(seen.in_view.mean(axis=1), 0.15)
+    sharp = mostly & (seen.reach_px >= SHARP_REACH_PX)
+    if sharp_only and len(set((seen.edge[sharp] % 4).tolist())) == 4:
+        return seen.found & sharp[:, None]
     return seen.found & (mostly & (seen.reach_px >= LEAST_REACH_PX))[:, None]
 
 
@@ -105,24 +116,25 @@ def _robust_least_squares(
 
     Returns x, the weights, the standard deviation of one point, and the covariance of x.
     """
-    robust = np.ones(len(offset))
-    prior = prior_sigma**-2.0
-    scale = np.linalg.norm(A, axis=0) + 1e-12  # metres and radians differ by orders: solve in units of pixels
-    sigma_px = max(_spread(offset - np.median(offset)), 0.3)
+    scale = np.sqrt((A * A).sum(axis=0)) + 1e-12  # metres and radians differ by orders: solve in units of pixels
+    A = A / scale
+    prior = np.diag((prior_sigma * scale) ** -2.0 + 1e-9)
+    weight = share
+    sigma_px = max(_spread(offset - offset.mean()), 0.3)
     for _ in range(REWEIGHTINGS):
-        weighted = (A / scale) * (robust * share / sigma_px**2)[:, None]
-        information = (A / scale).T @ weighted + np.diag(prior / scale**2 + 1e-9)
-        x = np.linalg.solve(information, weighted.T @ offset) / scale
+        weighted = A.T * (weight / sigma_px**2)
+        information = weighted @ A + prior
+        x = np.linalg.solve(information, weighted @ offset)
         residual = offset - A @ x
         sigma_px = max(_spread(residual), NOISE_FLOOR_PX)
-        robust = np.clip(1 - (residual / (TUKEY * sigma_px)) ** 2, 0, None) ** 2
-    covariance = np.linalg.inv(information) / np.outer(scale, scale)
-    return x, robust * share, sigma_px, covariance
+        weight = share * np.maximum(1 - (residual / (TUKEY * sigma_px)) ** 2, 0) ** 2
+    return x / scale, weight, sigma_px, np.linalg.inv(information) / np.outer(scale, scale)
 
 
 def _spread(residual: Array) -> float:
     """Return the robust standard deviation: 1.4826 times the median absolute residual."""
-    return float(1.4826 * np.median(np.abs(residual)))
+    middle = len(residual) // 2
+    return float(1.4826 * np.partition(np.abs(residual), middle)[middle])
 
 
 def measure_layers(fit: EdgeFit[W], shape: tuple[int, int]) -> tuple[LayerDetection, ...]:

@@ -27,15 +27,11 @@ def layer_side_px(warp: FittedWarp, layer: int) -> float:
     return float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
 
 
-def fit_own_edges(light: Light, warp: FittedWarp, layer: int) -> FittedWarp | None:
+def fit_own_edges(light: Light, warp: FittedWarp, layer: int) -> Fit | None:
     """Return a warp that is right to a few pixels fitted to the edges of one layer, None when they are not there."""
     own = ALL_EDGES[layer == EDGE_LAYER]
-    for search_px in (max(2.5, 0.03 * layer_side_px(warp, layer)), SETTLE_PX):
-        fit = fit_edges(light, warp, own, min(search_px, MAX_SEARCH_PX))
-        if fit is None:
-            return None
-        warp = fit.warp
-    return warp
+    first = fit_edges(light, warp, own, _search_px(warp, layer, 0.03))
+    return None if first is None else fit_edges(light, first.warp, own, SETTLE_PX)
 
 
 def grow(light: Light, warp: FittedWarp, layer: int) -> Fit | None:
@@ -43,23 +39,20 @@ def grow(light: Light, warp: FittedWarp, layer: int) -> Fit | None:
 
     On a surface that is not known the warp may bend as it grows, and stays flat if that explains the edges.
     """
-    search_px = min(max(2.5, 0.02 * layer_side_px(warp, layer)), MAX_SEARCH_PX)
+    search_px = _search_px(warp, layer, 0.02)
+    flat = _grow_through(light, warp, layer, search_px)
+    if not isinstance(warp, HomographyWarp):
+        return flat
+    bent = _grow_through(light, BentWarp(warp, np.zeros((2, 3))), layer, search_px)
+    if flat is None or bent is None:
+        return flat or bent
+    return bent if bent.cost < CURVED_GAIN * flat.cost else flat
+
+
+def _grow_through(light: Light, warp: FittedWarp, layer: int, search_px: float) -> Fit | None:
+    """Return the settled fit after taking in the nearest layers, then all."""
     near = ALL_EDGES[np.abs(EDGE_LAYER - layer) <= 1]
-    plans: list[FittedWarp] = [warp]
-    if isinstance(warp, HomographyWarp):
-        plans.append(BentWarp(warp, np.zeros((2, 3))))
-    grown = [fit for plan in plans if (fit := _grow_through(light, plan, (near, ALL_EDGES), search_px)) is not None]
-    if not grown:
-        return None
-    flat = grown[0]
-    return min(grown, key=lambda fit: fit.cost / (CURVED_GAIN if fit is flat else 1.0))
-
-
-def _grow_through(
-    light: Light, warp: FittedWarp, stages: tuple[NDArray[np.int64], ...], search_px: float
-) -> Fit | None:
-    """Return the settled fit after taking in the edges of each stage."""
-    for edges in stages:
+    for edges in (near, ALL_EDGES) if layer > 0 else (ALL_EDGES,):
         fit = fit_edges(light, warp, edges, search_px)
         if fit is None:
             return None
@@ -68,6 +61,13 @@ def _grow_through(
 
 
 def settle(light: Light, warp: FittedWarp) -> Fit | None:
-    """Return the final fit to all edges from a warp that is right to a pixel or two."""
-    fit = fit_edges(light, warp, ALL_EDGES, SETTLE_PX)
-    return None if fit is None else fit_edges(light, fit.warp, ALL_EDGES, SETTLE_PX)
+    """Return the final fit to all edges from a warp that is right to a pixel or two.
+
+    A bend needs the inner squares even where their frames are thin: the outer edges do not fix the inside.
+    """
+    return fit_edges(light, warp, ALL_EDGES, SETTLE_PX, sharp_only=not isinstance(warp, BentWarp))
+
+
+def _search_px(warp: FittedWarp, layer: int, fraction: float) -> float:
+    """Return how far to look for edges when the warp is known to a fraction of a layer's side."""
+    return min(max(2.5, fraction * layer_side_px(warp, layer)), MAX_SEARCH_PX)

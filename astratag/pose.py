@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,13 +18,13 @@ from astratag.warp import PoseWarp
 
 Array = NDArray[np.float64]
 
+REFINEMENT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-9)
 MAX_STEPS = 30
 CONVERGED_PX2 = 1e-9
 """Stop when the squared error, in sigmas, no longer falls by this fraction."""
 
 
-@dataclass(frozen=True, eq=False)
-class CornerPose:
+class CornerPose(NamedTuple):
     """A pose refined on corners: ``covariance`` (6, 6) metres then radians, right perturbation in marker axes."""
 
     T_cam_marker: Array
@@ -64,30 +64,45 @@ def poses_from_square(
 
 def planar_poses(
     camera: Camera, layers: Sequence[LayerDetection], side_m: float, surface: Surface
-) -> tuple[CornerPose, ...]:
+) -> tuple[PlanarPose, ...]:
     """Return both poses that explain the measured layers, each refined on all their corners, the better first."""
     if not layers:
         return ()
     largest = min(layers, key=lambda seen: seen.layer)
     starts = poses_from_square(camera, square(*LAYERS[largest.layer].black), largest.corners_px, side_m, surface)
-    refined = [refine_on_corners(PoseWarp(camera, side_m, surface, start), layers) for start in starts]
-    return tuple(sorted((r for r in refined if r is not None), key=lambda r: r.reprojection_rms_px))
+    template, corners_px = np.concatenate([square(*LAYERS[seen.layer].black) for seen in layers]), _corners(layers)
+    points_marker = surface.points(print_from_template(template, side_m))
+    found = []
+    for start in starts:
+        rotation, translation = cv2.solvePnPRefineLM(
+            points_marker,
+            corners_px,
+            camera.K,
+            camera.distortion,
+            cv2.Rodrigues(start[:3, :3])[0],
+            start[:3, 3:].copy(),
+            REFINEMENT,
+        )
+        if np.isfinite(rotation).all() and translation[2, 0] > 0:
+            T_cam_marker = pose(cv2.Rodrigues(rotation)[0], translation)
+            off = PoseWarp(camera, side_m, surface, T_cam_marker)(template) - corners_px
+            found.append(PlanarPose(T_cam_marker, float(np.sqrt((off**2).sum(axis=1).mean()))))
+    return tuple(sorted(found, key=lambda planar: planar.reprojection_rms_px))
 
 
-def as_planar(poses: Sequence[CornerPose]) -> tuple[PlanarPose, ...]:
-    """Return what a detection keeps of both poses."""
-    return tuple(PlanarPose(p.T_cam_marker, p.reprojection_rms_px) for p in poses)
+def _corners(layers: Sequence[LayerDetection]) -> Array:
+    """Return all corners of the layers, (4 L, 2) pixels."""
+    return np.concatenate([seen.corners_px for seen in layers])
 
 
-def refine_on_corners(start: PoseWarp, layers: Sequence[LayerDetection]) -> CornerPose | None:
+def refine_on_corners(start: PoseWarp, layers: Sequence[LayerDetection]) -> CornerPose:
     """Return the pose that fits all corners of all layers best, weighted by their sigmas, from a start nearby.
 
     Levenberg-Marquardt over the corners as they lie on the marker's surface.  The covariance follows from the
-    corners' sigmas, enlarged when the corners do not fit as well as these promise.  None when it ends behind
-    the camera.
+    corners' sigmas, enlarged when the corners do not fit as well as these promise.
     """
     template = np.concatenate([square(*LAYERS[seen.layer].black) for seen in layers])
-    corners_px = np.concatenate([seen.corners_px for seen in layers])
+    corners_px = _corners(layers)
     sigma_px = np.repeat([seen.sigma_px for seen in layers], 8)
     warp, damping = start, 1e-3
 
@@ -110,8 +125,6 @@ def refine_on_corners(start: PoseWarp, layers: Sequence[LayerDetection]) -> Corn
         warp, residual, damping = moved, after, damping / 10
         if gain <= CONVERGED_PX2 * (1 + after @ after):
             break
-    if warp.T_cam_marker[2, 3] <= 0:
-        return None
     misfit = max(1.0, residual @ residual / max(len(residual) - 6, 1))
     J = warp.jacobian(template).reshape(-1, 6) / sigma_px[:, None]
     reprojection_rms_px = float(np.sqrt(((residual * sigma_px) ** 2).reshape(-1, 2).sum(axis=1).mean()))

@@ -86,9 +86,9 @@ class Codebook:
             return []
         correlations = unit(cells) @ self._unit_codes.T
         best = correlations.argmax(axis=1)
-        ids, bits = self.dictionary.ids, self.dictionary.oriented.reshape(-1, CELLS)
+        wrong = hamming(cells, self.dictionary.oriented.reshape(-1, CELLS)[best])
         return [
-            Reading(ids[b // 4], int(b % 4), float(correlations[q, b]), hamming(cells[q], bits[b]))
+            Reading(self.dictionary.ids[b // 4], int(b % 4), float(correlations[q, b]), int(wrong[q]))
             for q, b in enumerate(best)
         ]
 
@@ -96,7 +96,7 @@ class Codebook:
         """Return how well cells (48,) fit an upright marker of a known identity."""
         row = self.dictionary.ids.index(marker_id)
         correlation = float(unit(cells[None])[0] @ self._unit_codes[4 * row])
-        return Reading(marker_id, 0, correlation, hamming(cells, self.dictionary.signatures[row]))
+        return Reading(marker_id, 0, correlation, int(hamming(cells[None], self.dictionary.signatures[row][None])[0]))
 
 
 def unit(cells: Array) -> Array:
@@ -106,10 +106,12 @@ def unit(cells: Array) -> Array:
     return centred / np.where(length > 1e-9, length, np.inf)
 
 
-def hamming(cells: Array, code: NDArray[np.uint8]) -> int:
-    """Return how many cells (48,) fall on the wrong side of the level half way between black and white."""
-    middle = (cells[code == 1].mean() + cells[code == 0].mean()) / 2
-    return int(((cells > middle) != (code == 1)).sum())
+def hamming(cells: Array, codes: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Return how many cells of each row (Q, 48) are on the wrong side of half way from its code's black to white."""
+    ones = codes.sum(axis=1)
+    white = (cells * codes).sum(axis=1) / np.maximum(ones, 1)
+    black = (cells * (1 - codes)).sum(axis=1) / np.maximum(CELLS - ones, 1)
+    return ((cells > ((white + black) / 2)[:, None]) != (codes == 1)).sum(axis=1)
 
 
 def sample(gray: Image, points_px: Array) -> Array:

@@ -64,7 +64,7 @@ def _knots() -> Array:
 
 
 KNOTS = _knots()
-"""Correspondences (16, 2), in fours: outer corners, outer sides' middles, corners of the first frame and last square."""
+"""Correspondences (16, 2), in fours: outer corners, outer sides' middles, corners of first frame and last square."""
 
 BENDS = (-0.21, -0.14, -0.07, 0.0, 0.07, 0.14, 0.21)
 """How far the middle of a bent print may lie from where it would if flat, as fractions of its sides."""

@@ -181,7 +181,9 @@ class PoseWarp:
         R_cam_marker = self.T_cam_marker[:3, :3]
         by_point = self.camera.projection_jacobian(transform(self.T_cam_marker, points_marker))
         by_rho = by_point @ R_cam_marker
-        by_theta = np.cross(points_marker[:, None, :], by_rho)  # -[X]x transposed: row . (theta x X)
+        x, y, z = (points_marker[:, axis, None] for axis in range(3))
+        gx, gy, gz = (by_rho[:, :, axis] for axis in range(3))
+        by_theta = np.stack([y * gz - z * gy, z * gx - x * gz, x * gy - y * gx], axis=2)  # g . (theta x X)
         return np.concatenate([by_rho, by_theta], axis=2)
 
     def stepped(self, delta: Array) -> PoseWarp:
@@ -190,6 +192,9 @@ class PoseWarp:
 
     def visible(self, template: Array) -> NDArray[np.bool_]:
         """Return which points face the camera by more than a grazing angle."""
+        if not self.curved:
+            facing = -(self.T_cam_marker[:3, 3] @ self.T_cam_marker[:3, 2])  # distance from the plane
+            return np.full(len(template), facing > GRAZING_COSINE * np.linalg.norm(self.T_cam_marker[:3, 3]))
         on_print = print_from_template(template, self.side_m)
         points_cam = transform(self.T_cam_marker, self.surface.points(on_print))
         normals_cam = self.surface.normals(on_print) @ self.T_cam_marker[:3, :3].T

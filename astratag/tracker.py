@@ -1,0 +1,119 @@
+"""The tracker: a detector with memory, which looks first where markers must be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astratag.camera import Camera
+from astratag.candidates import OUTER
+from astratag.detection import Detection
+from astratag.detector import Detector, View, surest
+from astratag.fit import fit_edges
+from astratag.grow import ALL_EDGES, Fit, grow, settle
+from astratag.search import find_quads
+from astratag.surface import Flat
+from astratag.transforms import inverse
+from astratag.warp import FittedWarp, HomographyWarp, PoseWarp
+
+Array = NDArray[np.float64]
+
+SEARCH_EVERY = 10
+"""Frames between searches of the whole image for markers not yet tracked."""
+TRACK_PX = 6.0
+"""How far from its prediction an edge may be."""
+COST_LIMIT = 3.0
+"""Mean truncated squared residual (of 9 at most) above which a followed fit is not believed."""
+LOCAL_MARGIN = 0.5
+"""How much wider than the marker, on each side as a fraction of its size, a local search looks."""
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Where one marker was in the last frame and the one before (None when it was not seen then)."""
+
+    marker_id: int
+    T_cam_marker: Array
+    T_cam_marker_before: Array | None
+
+    def predictions(self) -> list[Array]:
+        """Return where the marker may be now: moved on as it moved last, or where it was."""
+        if self.T_cam_marker_before is None:
+            return [self.T_cam_marker]
+        motion = inverse(self.T_cam_marker_before) @ self.T_cam_marker
+        return [self.T_cam_marker @ motion, self.T_cam_marker]
+
+
+class Tracker:
+    """Finds the markers of a detector in consecutive images of one camera.
+
+    Each marker's edges are predicted from its last motion, refined and verified by its code; then looked for
+    nearby; then in the whole image, which is also searched now and then for markers that come into view.
+    The same images give the same detections.
+    """
+
+    def __init__(self, detector: Detector) -> None:
+        self.detector = detector
+        self._tracks: list[Track] = []
+        self._frames = 0
+
+    def reset(self) -> None:
+        """Forget all markers, as before the first image."""
+        self._tracks, self._frames = [], 0
+
+    def detect(self, image: NDArray[np.uint8], camera: Camera | None = None) -> list[Detection]:
+        """Return the markers in the next image, the surest first; without ``camera`` every image is searched.
+
+        Raises ValueError as ``Detector.detect`` does.
+        """
+        view = self.detector.view(image, camera)
+        tracks = self._tracks if camera is not None else []
+        followed = [(track, seen) for track in tracks if (seen := self._follow(view, track)) is not None]
+        found = [seen for _, seen in followed]
+        if not found or len(found) < len(tracks) or self._frames % SEARCH_EVERY == 0:
+            found = surest(self.detector.find(view), first=found)
+        before = {id(seen): track.T_cam_marker for track, seen in followed}
+        self._tracks = [
+            Track(seen.marker_id, seen.T_cam_marker, before.get(id(seen)))
+            for seen in found
+            if seen.T_cam_marker is not None
+        ]
+        self._frames += 1
+        return found
+
+    def _follow(self, view: View, track: Track) -> Detection | None:
+        """Return a tracked marker where it is predicted, or near there; None when it is lost."""
+        for T_cam_marker in track.predictions():
+            fit = self._fit_near(view, track.marker_id, T_cam_marker)
+            if fit is not None and fit.cost < COST_LIMIT:
+                detection = self.detector.describe(view, track.marker_id, fit, "tracked")
+                if detection is not None:
+                    return detection
+        return self._search_near(view, track)
+
+    def _fit_near(self, view: View, marker_id: int, T_cam_marker: Array) -> Fit | None:
+        """Return the fit to all edges around a predicted pose."""
+        spec = self.detector.spec(marker_id)
+        assert view.camera is not None
+        warp: FittedWarp = PoseWarp(view.camera, spec.side_m, spec.surface or Flat(), T_cam_marker)
+        if spec.surface is None:
+            return grow(view.light, HomographyWarp.from_points(OUTER, warp(OUTER)), 0)
+        fit = fit_edges(view.light, warp, ALL_EDGES, TRACK_PX)
+        return None if fit is None else settle(view.light, fit.warp)
+
+    def _search_near(self, view: View, track: Track) -> Detection | None:
+        """Return a lost marker from a search of the part of the image it should be in."""
+        spec = self.detector.spec(track.marker_id)
+        assert view.camera is not None
+        outline = PoseWarp(view.camera, spec.side_m, spec.surface or Flat(), track.T_cam_marker)(OUTER)
+        margin = LOCAL_MARGIN * (outline.max(axis=0) - outline.min(axis=0))
+        height, width = view.gray.shape
+        low = np.clip(outline.min(axis=0) - margin, 0, (width, height)).astype(int)
+        high = np.clip(outline.max(axis=0) + margin, 0, (width, height)).astype(int)
+        if (high - low).min() < 16:
+            return None
+        part = view.gray[low[1] : high[1], low[0] : high[0]]
+        found, _ = self.detector.search(view, find_quads(part, halve=part.size > 300_000) + low)
+        return next((seen for seen in found if seen.marker_id == track.marker_id), None)
