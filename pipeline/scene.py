@@ -27,8 +27,10 @@ Component = NDArray[Any]
 Line = tuple[Any, Any, Any]
 """Three components of the rays' origins, directions or normals; a float where all rays share it."""
 
-SHADOW_GAP_M = 1e-3
+SHADOW_GAP_M = 1e-4
 """Nearer than this to the lit point nothing casts a shadow: a surface does not shade itself by rounding."""
+
+PENUMBRA_PX = 0.7
 
 EXHAUSTIVE_SAMPLES = 7
 """So many orders can all be tried."""
@@ -295,8 +297,11 @@ class Scene:
                     met = caster.shape.hit(start, _floats(T_caster_cam[:3, :3] @ self.sun.direction_cam))
                 free &= ~(met.seen & (met.depth > SHADOW_GAP_M))
             light[where] = free
-        # A body that covers only part of a pixel borrows the light of its neighbour.
-        np.copyto(light, cv2.erode(light, np.ones((3, 3), np.uint8)), where=winner < 0)
+        # A body that covers only part of a pixel borrows the light of its neighbour; inside it, shadows end softly.
+        around = np.ones((3, 3), np.uint8)
+        np.copyto(light, cv2.erode(light, around), where=winner < 0)
+        alone = cv2.erode(winner, around) == cv2.dilate(winner, around)
+        np.copyto(light, cv2.GaussianBlur(light, (0, 0), PENUMBRA_PX), where=alone)
         return light
 
 

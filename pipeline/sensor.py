@@ -30,7 +30,7 @@ class Sensor:
     focus_m: float = 0.35
     glow: float = 0.015
     vignetting: float = 0.18
-    full_well_e: float = 9000.0
+    full_well_e: float = 12000.0
     read_noise_e: float = 4.0
 
     def blur_at_px(self, range_m: float, focal_px: float) -> float:
