@@ -1,0 +1,56 @@
+"""A small recording for the tests of the nodes: a flat marker comes in, with truth, in pictures cheap to make."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+
+from astratag.camera import Camera
+from astratag.dictionary import load_dictionary
+from astratag.transforms import exp_so3, pose
+from pipeline.convert import calibration_message, pose_message, vector_message
+from pipeline.mission import MarkerSection, Mission
+from pipeline.recording import RecordingWriter
+from pipeline.render import render_marker
+from schemas import Envelope, Stamp, Truth
+from schemas.codec import AnyMessage
+
+START_NS = 1_800_000_000_000_000_000
+PERIOD_NS = 50_000_000
+MISSION = Mission(markers=(MarkerSection(id=7, side_m=0.1),))
+CAMERA = Camera([[600, 0, 319.5], [0, 600, 179.5], [0, 0, 1]], width=640, height=360)
+SPEED_M_S = 0.1
+"""Of the approach; the marker turns slowly as it comes."""
+
+
+def write_small_recording(path: Path, *, frames: int, camera: Camera = CAMERA, samples: int = 2) -> Path:
+    """Write ``frames`` frames at 20 Hz, ending 0.3 m from the marker."""
+    with RecordingWriter(path, MISSION) as writer:
+
+        def write(message: AnyMessage, k: int) -> None:
+            stamp = Stamp(k, START_NS + k * PERIOD_NS, 0)
+            writer.write(Envelope.wrap(message, stamp, vehicle="chaser", camera="nav"), stamp.t_capture_ns)
+
+        write(calibration_message(camera, frame_id="nav", t_capture_ns=START_NS), 0)
+        for k in range(frames):
+            t_s = k * PERIOD_NS * 1e-9
+            range_m = 0.3 + SPEED_M_S * (frames * PERIOD_NS * 1e-9 - t_s)
+            rate_rad_s = np.array([0.0, 0.0, 0.05])
+            R_cam_marker = exp_so3((np.pi, 0, 0)) @ exp_so3((0.3, 0.2, 0.0)) @ exp_so3(rate_rad_s * t_s)
+            T_cam_marker = pose(R_cam_marker, (0.01, -0.01, range_m))
+            truth = Truth(
+                t_capture_ns=START_NS + k * PERIOD_NS,
+                T_chaser_target=pose_message(T_cam_marker),
+                v_chaser_target_m_s=vector_message((0, 0, -SPEED_M_S)),
+                omega_chaser_target_in_target_rad_s=vector_message(rate_rad_s),
+            )
+            write(truth, k)
+            signature = load_dictionary("astratag20").signature(7)
+            image = render_marker(camera, T_cam_marker, signature=signature, side_m=0.1, seed=k, samples=samples)
+            frame = CompressedImage(frame_id="nav", format="jpeg", data=cv2.imencode(".jpg", image)[1].tobytes())
+            frame.timestamp.FromNanoseconds(START_NS + k * PERIOD_NS)
+            write(frame, k)
+    return path
