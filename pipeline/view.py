@@ -68,8 +68,9 @@ KEPT_FRAMES = 256
 """Frames for which a truth waits for its state, or the other way round."""
 NIS_BAND = (0.025, 0.975)
 SIGMAS = 3.0
-HIDDEN_SCALE = 1e-6
-CHASER_M = (0.14, 0.14, 0.16)
+OUT_OF_SIGHT_M = (0.0, 1e3, 1e3)
+"""Where a chaser without a state waits: behind every eye that looks at the target."""
+CHASER_M = (0.11, 0.11, 0.13)
 """The chaser as drawn: width, height and depth behind its docking port."""
 
 ESTIMATE, TRUE, BOUND, CORRIDOR, GRID = 0x4CB8FFFF, 0x8CE05AFF, 0x8B93A3FF, 0x9B7BFFFF, 0xFFFFFF50
@@ -224,9 +225,9 @@ class Viewer:
         )
         markers = [(m.id, m.T_target_marker.matrix(), m.side_m, m.surface.surface()) for m in self._mission.markers]
         self._draw_target(markers)
-        self._draw_vehicle("estimate", ESTIMATE)
+        self._draw_vehicle("estimate", ESTIMATE, width=1.5)
         style = rr.Ellipsoids3D.from_fields(
-            colors=[ESTIMATE], fill_mode=rr.components.FillMode.TransparentFillMajorWireframe, line_radii=[-0.5]
+            colors=[ESTIMATE], fill_mode=rr.components.FillMode.TransparentFillMajorWireframe, line_radii=[-1.0]
         )
         self._log("scene/estimate/ellipsoid", style, static=True)
         self._draw_overlay_styles()
@@ -245,19 +246,20 @@ class Viewer:
             path = f"scene/target/marker_{marker_id}"
             self._log(path, _transform3d(T_target_marker), drawn, static=True)
 
-    def _draw_vehicle(self, whose: str, color: int) -> None:
-        """Draw a chaser's hull in its own frame, and style what moves with it."""
-        width, height, depth = CHASER_M
+    def _draw_vehicle(self, whose: str, color: int, *, width: float) -> None:
+        """Draw a chaser's hull in its own frame and style its path, in lines of ``width`` points of the screen."""
+        half = np.array(CHASER_M) / 2
+        radius = rr.Radius.ui_points(width)
         box = rr.Boxes3D(
-            centers=[(0.0, 0.0, -depth / 2)],
-            half_sizes=[(width / 2, height / 2, depth / 2)],
+            centers=[(0.0, 0.0, -half[2])],
+            half_sizes=[half],
             colors=color,
-            radii=rr.Radius.ui_points(1.2),
+            radii=radius,
             fill_mode=rr.components.FillMode.MajorWireframe,
         )
         hull = f"scene/{whose}/chaser/hull"
         self._log(hull, _transform3d(self._T_chaser_port), box, static=True)
-        style = rr.LineStrips3D.from_fields(colors=[color], radii=rr.Radius.ui_points(1.5))
+        style = rr.LineStrips3D.from_fields(colors=[color], radii=radius)
         self._log(f"scene/{whose}/path", style, static=True)
 
     def _draw_overlay_styles(self) -> None:
@@ -277,8 +279,8 @@ class Viewer:
         three_sigma = f"{SIGMAS:.0f} sigma"
         for name in ("range_m", "lateral_mm", "closing_mm_s"):
             _style(self._log, f"plots/{name}/bound", [f"+{three_sigma}", f"-{three_sigma}"], [BOUND] * 2, width=1.0)
-            _style(self._log, f"plots/{name}/truth", ["truth"], [TRUE])
-            _style(self._log, f"plots/{name}/estimate", ["estimate"], [ESTIMATE])
+            _style(self._log, f"plots/{name}/truth", ["truth"], [TRUE], width=1.2)
+            _style(self._log, f"plots/{name}/estimate", ["estimate"], [ESTIMATE], width=2.5)
         for name in ("position_error_mm", "attitude_error_deg"):
             _style(self._log, f"plots/{name}/bound", [three_sigma], [BOUND], width=1.0)
             _style(self._log, f"plots/{name}/error", ["estimate - truth"], [ESTIMATE])
@@ -426,10 +428,10 @@ class Viewer:
             self._log(f"plots/{name}/{whose}", rr.Scalars(scale * value))
 
     def _hide_chaser(self) -> None:
-        """Shrink the estimated chaser to a point: there is no state, and nowhere to draw it."""
+        """Put the estimated chaser out of sight: there is no state, and nowhere to draw it."""
         if self._changed("chaser shown", False):
             self._last.pop("estimate", None)
-            self._log(CHASER, rr.Transform3D(scale=HIDDEN_SCALE))
+            self._log(CHASER, rr.Transform3D(translation=OUT_OF_SIGHT_M))
             self._log("scene/estimate/ellipsoid", rr.Clear(recursive=False))
 
     def _draw_frustum(self, range_m: float) -> None:
@@ -441,7 +443,7 @@ class Viewer:
 
     def _draw_truth(self, truth: Truth, envelope: Envelope, _t_ns: int) -> None:
         if "truth" not in self._last:
-            self._draw_vehicle("truth", TRUE)
+            self._draw_vehicle("truth", TRUE, width=0.8)
         T_chaser_target = pose_matrix(truth.T_chaser_target)
         self._draw_chaser("truth", T_chaser_target, self._motion(truth, T_chaser_target))
         self._draw_errors(envelope.stamp.sequence, truth=T_chaser_target)
@@ -632,9 +634,12 @@ class _Window(_Live):
             return "there is no display"
         options = ("--port", str(self._port), "--bind", "127.0.0.1", "--hide-welcome-screen", "--expect-data-soon")
         quiet = subprocess.DEVNULL
-        process = subprocess.Popen(
-            [*VIEWER_COMMAND, *options], stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True
-        )
+        try:
+            process = subprocess.Popen(
+                [*VIEWER_COMMAND, *options], stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True
+            )
+        except OSError as error:
+            return f"it cannot be started: {error.strerror}"
         deadline_s = time.monotonic() + START_TIMEOUT_S
         while time.monotonic() < deadline_s:
             listening = _listening(self._port)
