@@ -1,0 +1,144 @@
+"""The source's timelines: a recording repeated, retimed as if the camera looked now, and replayed in a window."""
+
+import itertools
+from collections.abc import Iterator
+
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+
+from nodes import source as source_module
+from nodes.bus import Credit, Event, Link, Presence
+from nodes.shell import NodeOptions
+from nodes.source import WINDOW, Pace, Resume, SourceNode, repeated, retimed
+from pipeline.mission import Mission
+from schemas import Envelope, Pose, Quaternion, Stamp, Truth, Vector3, encode
+from schemas.topics import CALIBRATION, FRAME, TRUTH
+
+PERIOD_NS = 50_000_000
+START_NS = 1_000_000_000_000
+
+
+def recording(frames: int) -> Iterator[Envelope]:
+    """Yield a calibration and bare frames at 20 Hz."""
+    yield Envelope(CALIBRATION, "k", b"", Stamp(0, START_NS, 0))
+    for k in range(frames):
+        yield Envelope(FRAME, "f", b"", Stamp(k, START_NS + k * PERIOD_NS, 0))
+
+
+def test_a_recording_played_once_is_itself():
+    assert list(repeated(lambda: recording(3), loop=False)) == list(recording(3))
+
+
+def test_a_recording_repeated_goes_on_in_number_and_time():
+    played = list(itertools.islice(repeated(lambda: recording(3), loop=True), 10))
+    frames = [envelope.stamp for envelope in played if envelope.topic is FRAME]
+    assert [stamp.sequence for stamp in frames] == list(range(9))
+    assert [stamp.t_capture_ns - START_NS for stamp in frames] == [k * PERIOD_NS for k in range(9)]
+    assert sum(envelope.topic is CALIBRATION for envelope in played) == 1
+
+
+def test_an_empty_recording_is_not_repeated_for_ever():
+    assert len(list(repeated(lambda: recording(0), loop=True))) == 1
+
+
+def test_retiming_moves_the_stamp_and_the_message():
+    image = CompressedImage(data=b"jpeg", format="jpeg")
+    origin = Vector3(x=0, y=0, z=0)
+    pose = Pose(translation_m=origin, rotation_wxyz=Quaternion(w=1, x=0, y=0, z=0))
+    truth = Truth(
+        t_capture_ns=5,
+        T_chaser_target=pose,
+        v_chaser_target_m_s=origin,
+        omega_chaser_target_in_target_rad_s=origin,
+    )
+    t_ns = 1_800_000_000_123_456_789
+    for topic, message in ((FRAME, image), (TRUTH, truth)):
+        moved = retimed(Envelope(topic, "k", encode(message), Stamp(4, 5, 6)), t_ns)
+        assert moved.stamp == Stamp(4, t_ns, 6)
+        message = moved.message()
+        assert t_ns == (message.timestamp.ToNanoseconds() if topic is FRAME else message.t_capture_ns)
+
+
+class Others:
+    """The rest of a run as the source sees it: a bus on which each node acknowledges when it is asked to."""
+
+    def __init__(self, names: tuple[str, ...]):
+        self.mailbox = self
+        self.events: list[Event] = [Presence(name, alive=True) for name in names]
+        self.published: list[Envelope] = []
+        self.last_word: Credit | None = None
+        self.names = names
+        self.most_in_flight = 0
+        self.acknowledged = dict.fromkeys(names, -1)
+
+    def get(self, timeout_s: float) -> Event | None:
+        if self.events:
+            return self.events.pop(0)
+        behind = min(self.names, key=self.acknowledged.__getitem__)
+        if self.acknowledged[behind] < len(self.published) - 1:
+            self.acknowledged[behind] += 1
+            return Credit(behind, self.acknowledged[behind])
+        return None
+
+    def watch(self, nodes: object) -> None: ...
+
+    def announce(self) -> None: ...
+
+    def publish(self, envelope: Envelope) -> None:
+        if envelope.topic is FRAME:
+            self.published.append(envelope)
+            self.most_in_flight = max(self.most_in_flight, len(self.published) - 1 - min(self.acknowledged.values()))
+
+    def send(self, credit: Credit) -> None:
+        self.last_word = credit
+
+    def is_set(self) -> bool:
+        return self.last_word is not None
+
+
+class Film:
+    """A source of frames in memory."""
+
+    live = False
+
+    def __init__(self, frames: int):
+        self.frames = frames
+
+    def envelopes(self) -> Iterator[Envelope]:
+        return recording(self.frames)
+
+
+def play(frames: int, others: Others, *, lossless: bool = True, pace: Pace) -> None:
+    options = NodeOptions(Mission(), Link("", "peer"), lossless, others.names)
+    SourceNode(Film(frames), pace, options, others, others).run()  # type: ignore[arg-type]
+
+
+def test_a_replay_keeps_a_window_of_frames_in_flight_and_counts_what_it_published():
+    others = Others(("detector", "recorder"))
+    play(40, others, pace=Pace(speed=None))
+    assert [envelope.stamp.sequence for envelope in others.published] == list(range(40))
+    assert others.most_in_flight == WINDOW
+    assert others.last_word == Credit("source", 39, ended=True, published={"calibration": 1, "frame": 40})
+    assert all(envelope.stamp.t_origin_ns > 0 for envelope in others.published)
+
+
+def test_a_viewer_that_dies_is_not_waited_for():
+    """It acknowledges nothing and is gone: the replay goes on to its end."""
+    others = Others(("recorder", "viewer"))
+    others.names = ("recorder",)
+    others.events += [Presence("viewer", alive=False)]
+    others.acknowledged.pop("viewer")
+    options = NodeOptions(Mission(), Link("", "peer"), True, ("recorder", "viewer"))
+    SourceNode(Film(20), Pace(speed=None), options, others, others).run()  # type: ignore[arg-type]
+    assert len(others.published) == 20
+
+
+def test_a_source_started_again_goes_on_where_the_camera_would_be(monkeypatch):
+    """Killed after frame 3, back 0.3 s later: frames 4 to 7 are overdue, frame 8 is due in 0.05 s."""
+    clock_ns = 2_000_000_000_000_000_000
+    monkeypatch.setattr(source_module.time, "time_ns", lambda: clock_ns)
+    monkeypatch.setattr(SourceNode, "_wait_until", lambda self, due_s: None)
+    others = Others(("detector",))
+    resume = Resume(3, clock_ns - 4 * PERIOD_NS - source_module.OVERDUE_NS)
+    monkeypatch.setattr(source_module, "retimed", lambda envelope, t_ns: envelope)
+    play(12, others, lossless=False, pace=Pace(resume=resume))
+    assert [envelope.stamp.sequence for envelope in others.published] == [7, 8, 9, 10, 11]
