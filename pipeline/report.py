@@ -36,6 +36,8 @@ LAYER_NAMES = ("outer", "middle", "inner")
 BAND_PROBABILITY = 0.95
 RANGE_BINS = 40
 LATENCY_BINS = 50
+LABELLED_DECADES = 2.5
+"""A logarithmic axis longer than this has no room for labels between tenfolds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,8 +274,8 @@ def _draw_layers(ax: Axes, run: Run, c: Columns) -> None:
         base = 2 - layer
         ax.bar(edges[:-1], 0.86 * share, np.diff(edges), base, align="edge", color=ink, alpha=0.85, linewidth=0)
     ax.set_xscale("log")
-    _plain_numbers(ax.xaxis)
     ax.set_xlim(edges[-1], edges[0])
+    _plain_numbers(ax.xaxis)
     ax.set_ylim(0, 3)
     ax.set_yticks([2.43, 1.43, 0.43], LAYER_NAMES)
     ax.grid(False, axis="y")
@@ -304,9 +306,11 @@ def _time_axis(ax: Axes, t_s: Array) -> None:
 
 
 def _plain_numbers(axis: Axis) -> None:
-    """Label a logarithmic axis 0.1, 0.2, 0.5, 1, ... instead of with powers."""
+    """Label a logarithmic axis 0.1, 0.2, 0.5, 1, ... instead of with powers; a long one with tenfolds only."""
+    low, high = axis.get_view_interval()
+    digits = "25" if abs(np.log10(high / low)) < LABELLED_DECADES else ""
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(FuncFormatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "25" else ""))
+    axis.set_minor_formatter(FuncFormatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in digits else ""))
 
 
 def _if_any(label: str, values: Array) -> str:
