@@ -112,12 +112,23 @@ class Detector:
             found += bent
         return surest(found)
 
-    def view(self, image: NDArray[np.uint8], camera: Camera | None) -> View:
-        """Return an image made ready.  Raises ValueError as ``detect`` does."""
+    def view(
+        self, image: NDArray[np.uint8], camera: Camera | None, boxes: Sequence[NDArray[np.int64]] | None = None
+    ) -> View:
+        """Return an image made ready: all of it, or only ``boxes`` ((2, 2) pixels: low and high x, y) of its light.
+
+        Raises ValueError as ``detect`` does.
+        """
         gray = as_gray(image)
         if camera is not None:
             camera.require_size(gray.shape[1], gray.shape[0])
-        return View(gray, cv2.LUT(gray, self._light_of), camera)
+        if boxes is None:
+            return View(gray, cv2.LUT(gray, self._light_of), camera)
+        light = np.zeros(gray.shape, dtype=np.float32)
+        for (left, top), (right, bottom) in boxes:
+            part = slice(int(top), int(bottom)), slice(int(left), int(right))
+            light[part] = cv2.LUT(gray[part], self._light_of)
+        return View(gray, light, camera)
 
     def spec(self, marker_id: int) -> MarkerSpec:
         """Return how a marker was made."""

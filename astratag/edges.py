@@ -153,14 +153,14 @@ def locate(light: NDArray[np.float32], warp: FittedWarp, edges: NDArray[np.int64
     return EdgePoints(edges, predicted, normal, np.where(found, offset, 0.0), found, in_view, length_px, reach_px)
 
 
-def _derivative_filter(samples: int) -> Array:
-    """Return the matrix (samples, samples) that takes a profile to its smoothed slope, per pixel."""
-    x = (np.arange(samples)[:, None] - np.arange(samples)[None, :]) * STEP_PX
-    g = -x / SMOOTHING_PX**2 * np.exp(-0.5 * (x / SMOOTHING_PX) ** 2)
-    return (g / (np.sqrt(2 * np.pi) * SMOOTHING_PX) * STEP_PX).T
+def _derivative_kernel() -> NDArray[np.float32]:
+    """Return the row (1, K) whose correlation with a profile is its smoothed slope, per step."""
+    x = np.arange(-np.ceil(3.5 * SMOOTHING_PX / STEP_PX), np.ceil(3.5 * SMOOTHING_PX / STEP_PX) + 1) * STEP_PX
+    kernel = x * np.exp(-0.5 * (x / SMOOTHING_PX) ** 2)
+    return (kernel / (kernel @ x))[None].astype(np.float32)
 
 
-_FILTERS: dict[int, NDArray[np.float32]] = {}
+_DERIVATIVE = _derivative_kernel()
 
 
 def _steepest_rise(profile: NDArray[np.float32], limit_px: Array) -> tuple[Array, Array]:
@@ -168,20 +168,17 @@ def _steepest_rise(profile: NDArray[np.float32], limit_px: Array) -> tuple[Array
 
     The place is NaN where the steepest rise lies at the limit (E,) of the search: it is something else's.
     """
-    samples = profile.shape[2]
-    if samples not in _FILTERS:
-        _FILTERS[samples] = _derivative_filter(samples).astype(np.float32)
-    slope = profile @ _FILTERS[samples]
+    edges, points, samples = profile.shape
+    slope = cv2.filter2D(profile.reshape(-1, samples), -1, _DERIVATIVE, borderType=cv2.BORDER_REPLICATE)
     steps = (np.arange(samples) - samples // 2) * STEP_PX
-    allowed = (np.abs(steps)[None, :] <= limit_px[:, None] + 1e-9) & (
-        np.abs(steps) <= steps[-1] - 3 * SMOOTHING_PX + 0.3
-    )
-    slope_allowed = np.where(allowed[:, None, :], slope, -np.inf)
-    best = slope_allowed.argmax(axis=2)
-    best = np.clip(best, 1, samples - 2)
-    pick = np.take_along_axis
-    below, peak, above = (pick(slope, (best + d)[..., None], axis=2)[..., 0] for d in (-1, 0, 1))
+    trusted_px = np.minimum(limit_px, steps[-1] - 3 * SMOOTHING_PX + 0.3)[:, None] + 1e-9
+    forbidden = np.where(np.abs(steps) <= trusted_px, 0.0, -np.inf).astype(np.float32)
+    best = (slope.reshape(profile.shape) + forbidden[:, None, :]).argmax(axis=2).ravel()
+    at = np.arange(edges * points) * samples + np.clip(best, 1, samples - 2)
+    flat = slope.ravel()
+    below, peak, above = flat[at - 1], flat[at], flat[at + 1]
     curvature = 2 * peak - below - above
-    is_peak = (below < peak) & (above <= peak) & (curvature > 0)
-    shift = np.where(is_peak, 0.5 * (above - below) / np.where(curvature > 0, curvature, 1.0), np.nan)
-    return steps[best] + shift * STEP_PX, np.asarray(peak, dtype=float)
+    is_peak = (below < peak) & (above <= peak)
+    place = steps[best] + STEP_PX * 0.5 * (above - below) / np.where(is_peak, curvature, 1.0)
+    shape = (edges, points)
+    return np.where(is_peak, place, np.nan).reshape(shape), peak.astype(float).reshape(shape)

@@ -32,7 +32,7 @@ CORNER_FLOOR_PX = 0.02
 TUKEY = 4.685
 """Residuals beyond this many standard deviations weigh nothing (95 % efficiency on Gaussian noise)."""
 REWEIGHTINGS = 4
-SHARP_REACH_PX, LEAST_REACH_PX = 4.5, 1.2
+SHARP_REACH_PX, LEAST_REACH_PX = 4.0, 1.2
 """An edge this far from its neighbours is sharp; nearer, they pull, and below the least it is no edge of its own."""
 LEAST_FOUND = 0.4
 """Fraction of an edge's points that must be found for it to count."""
@@ -156,28 +156,32 @@ def measure_layers(fit: EdgeFit[W], shape: tuple[int, int]) -> tuple[LayerDetect
 def _layer_corners(fit: EdgeFit[W], black: tuple[float, float], rows: list[int]) -> tuple[Array, float]:
     """Return the corners (4, 2) of a square whose edges are ``rows`` of the fit, and their standard deviation."""
     template = square(*black)
-    predicted = fit.before(template)
     ahead = np.roll(template, -1, axis=0) - template
-    tangent_out = fit.before(template + 0.02 * ahead) - predicted  # of the edge that starts at each corner
-    tangent_in = predicted - fit.before(template - 0.02 * np.roll(ahead, 1, axis=0))  # of the one that ends there
-    lines = [_edge_line(fit.offset_px[row], fit.weight[row], fit.sigma_px) for row in rows]
-    corners, variance = np.empty((4, 2)), np.empty(4)
-    for c in range(4):
-        ends, starts = lines[c - 1], lines[c]
-        N = np.array([_outward(tangent_in[c]), _outward(tangent_out[c])])
-        solve = np.linalg.inv(N)
-        corners[c] = predicted[c] + solve @ (ends[0][1], starts[0][0])
-        variance[c] = (solve**2 @ (ends[1][1], starts[1][0])).mean()
-    return corners, float(np.sqrt(variance.mean() + CORNER_FLOOR_PX**2))
+    behind = np.roll(ahead, 1, axis=0)
+    predicted, along, before = fit.before(np.stack([template, template + 0.02 * ahead, template - 0.02 * behind]))
+    # row 0: the edge that ends at the corner, row 1: the one that starts there
+    N = np.stack([_outward(predicted - before), _outward(along - predicted)], axis=1)
+    offsets, variances = _edge_lines(fit.offset_px[rows], fit.weight[rows], fit.sigma_px)
+    solve = np.linalg.inv(N)
+    met = np.stack([np.roll(offsets[:, 1], 1), offsets[:, 0]], axis=1)
+    uncertain = np.stack([np.roll(variances[:, 1], 1), variances[:, 0]], axis=1)
+    corners = predicted + (solve @ met[:, :, None])[:, :, 0]
+    variance = (solve**2 @ uncertain[:, :, None]).mean()
+    return corners, float(np.sqrt(variance + CORNER_FLOOR_PX**2))
 
 
 def _outward(tangent: Array) -> Array:
-    """Return the unit normal to the left of a clockwise tangent, out of the square."""
-    return np.array([tangent[1], -tangent[0]]) / np.linalg.norm(tangent)
+    """Return the unit normals (N, 2) to the left of clockwise tangents (N, 2), out of the square."""
+    return np.stack([tangent[:, 1], -tangent[:, 0]], axis=1) / np.linalg.norm(tangent, axis=1, keepdims=True)
 
 
-def _edge_line(offset: Array, weight: Array, sigma_px: float) -> tuple[Array, Array]:
-    """Return the offset of a line fitted along an edge at its start and end (2,), and their variances (2,)."""
-    basis = np.stack([1 - ALONG, ALONG], axis=1)
-    covariance = np.linalg.inv(basis.T @ (weight[:, None] * basis))
-    return covariance @ (basis.T @ (weight * offset)), sigma_px**2 * np.diag(covariance)
+def _edge_lines(offset: Array, weight: Array, sigma_px: float) -> tuple[Array, Array]:
+    """Return the offsets (E, 2) of lines fitted along edges (E, M) at their starts and ends, and their variances."""
+    information = np.einsum("em,mi,mj->eij", weight, _LINE, _LINE)
+    covariance = np.linalg.inv(information)
+    ends = covariance @ ((weight * offset) @ _LINE)[:, :, None]
+    return ends[:, :, 0], sigma_px**2 * np.diagonal(covariance, axis1=1, axis2=2)
+
+
+_LINE = np.stack([1 - ALONG, ALONG], axis=1)
+"""What the points of an edge feel (M, 2) of an offset at its start and at its end."""

@@ -18,7 +18,7 @@ from astratag.warp import PoseWarp
 
 Array = NDArray[np.float64]
 
-REFINEMENT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-9)
+REFINEMENT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 1e-8)
 MAX_STEPS = 30
 CONVERGED_PX2 = 1e-9
 """Stop when the squared error, in sigmas, no longer falls by this fraction."""

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from astratag.camera import Camera
 from astratag.candidates import OUTER
 from astratag.detection import Detection
-from astratag.detector import Detector, View, surest
+from astratag.detector import HALVE_FROM_PX, Detector, View, surest
 from astratag.fit import fit_edges
 from astratag.grow import ALL_EDGES, Fit, grow, settle
 from astratag.search import find_quads
 from astratag.surface import Flat
-from astratag.transforms import inverse
+from astratag.transforms import difference, perturb
 from astratag.warp import FittedWarp, HomographyWarp, PoseWarp
 
 Array = NDArray[np.float64]
@@ -26,6 +26,7 @@ TRACK_PX = 6.0
 """How far from its prediction an edge may be."""
 COST_LIMIT = 3.0
 """Mean truncated squared residual (of 9 at most) above which a followed fit is not believed."""
+LEAST_BOX_PX = 16
 LOCAL_MARGIN = 0.5
 """How much wider than the marker, on each side as a fraction of its size, a local search looks."""
 
@@ -42,8 +43,8 @@ class Track:
         """Return where the marker may be now: moved on as it moved last, or where it was."""
         if self.T_cam_marker_before is None:
             return [self.T_cam_marker]
-        motion = inverse(self.T_cam_marker_before) @ self.T_cam_marker
-        return [self.T_cam_marker @ motion, self.T_cam_marker]
+        motion = difference(self.T_cam_marker, self.T_cam_marker_before)
+        return [perturb(self.T_cam_marker, motion), self.T_cam_marker]
 
 
 class Tracker:
@@ -68,13 +69,9 @@ class Tracker:
 
         Raises ValueError as ``Detector.detect`` does.
         """
-        view = self.detector.view(image, camera)
-        tracks = self._tracks if camera is not None else []
-        followed = [(track, seen) for track in tracks if (seen := self._follow(view, track)) is not None]
-        found = [seen for _, seen in followed]
-        if not found or len(found) < len(tracks) or self._frames % SEARCH_EVERY == 0:
-            found = surest(self.detector.find(view), first=found)
-        before = {id(seen): track.T_cam_marker for track, seen in followed}
+        found, before = self._follow_all(image, camera) if camera is not None and self._tracks else ([], {})
+        if not found or len(found) < len(self._tracks) or self._frames % SEARCH_EVERY == 0:
+            found = surest(self.detector.find(self.detector.view(image, camera)), first=found)
         self._tracks = [
             Track(seen.marker_id, seen.T_cam_marker, before.get(id(seen)))
             for seen in found
@@ -83,7 +80,30 @@ class Tracker:
         self._frames += 1
         return found
 
-    def _follow(self, view: View, track: Track) -> Detection | None:
+    def _follow_all(self, image: NDArray[np.uint8], camera: Camera) -> tuple[list[Detection], dict[int, Array]]:
+        """Return the tracked markers still seen, and for each (by Python's id) its pose in the last frame."""
+        boxes = [self._box(track, camera) for track in self._tracks]
+        view = self.detector.view(image, camera, [box for box in boxes if box is not None])
+        found: list[Detection] = []
+        before: dict[int, Array] = {}
+        for track, box in zip(self._tracks, boxes, strict=True):
+            seen = None if box is None else self._follow(view, track, box)
+            if seen is not None:
+                found.append(seen)
+                before[id(seen)] = track.T_cam_marker
+        return surest(found), before
+
+    def _box(self, track: Track, camera: Camera) -> NDArray[np.int64] | None:
+        """Return the part of the image (2, 2) a tracked marker should be in, low and high x, y; None when out of it."""
+        spec = self.detector.spec(track.marker_id)
+        surface = spec.surface or Flat()
+        around = np.concatenate([PoseWarp(camera, spec.side_m, surface, T)(OUTER) for T in track.predictions()])
+        margin = LOCAL_MARGIN * (around.max(axis=0) - around.min(axis=0))
+        box = np.stack([around.min(axis=0) - margin, around.max(axis=0) + margin])
+        box = np.clip(box, 0, (camera.width, camera.height)).astype(int)
+        return box if (box[1] - box[0]).min() >= LEAST_BOX_PX else None
+
+    def _follow(self, view: View, track: Track, box: NDArray[np.int64]) -> Detection | None:
         """Return a tracked marker where it is predicted, or near there; None when it is lost."""
         for T_cam_marker in track.predictions():
             fit = self._fit_near(view, track.marker_id, T_cam_marker)
@@ -91,7 +111,7 @@ class Tracker:
                 detection = self.detector.describe(view, track.marker_id, fit, "tracked")
                 if detection is not None:
                     return detection
-        return self._search_near(view, track)
+        return self._search_near(view, track, box)
 
     def _fit_near(self, view: View, marker_id: int, T_cam_marker: Array) -> Fit | None:
         """Return the fit to all edges around a predicted pose."""
@@ -103,17 +123,9 @@ class Tracker:
         fit = fit_edges(view.light, warp, ALL_EDGES, TRACK_PX)
         return None if fit is None else settle(view.light, fit.warp)
 
-    def _search_near(self, view: View, track: Track) -> Detection | None:
+    def _search_near(self, view: View, track: Track, box: NDArray[np.int64]) -> Detection | None:
         """Return a lost marker from a search of the part of the image it should be in."""
-        spec = self.detector.spec(track.marker_id)
-        assert view.camera is not None
-        outline = PoseWarp(view.camera, spec.side_m, spec.surface or Flat(), track.T_cam_marker)(OUTER)
-        margin = LOCAL_MARGIN * (outline.max(axis=0) - outline.min(axis=0))
-        height, width = view.gray.shape
-        low = np.clip(outline.min(axis=0) - margin, 0, (width, height)).astype(int)
-        high = np.clip(outline.max(axis=0) + margin, 0, (width, height)).astype(int)
-        if (high - low).min() < 16:
-            return None
-        part = view.gray[low[1] : high[1], low[0] : high[0]]
-        found, _ = self.detector.search(view, find_quads(part, halve=part.size > 300_000) + low)
+        (left, top), (right, bottom) = box
+        part = view.gray[top:bottom, left:right]
+        found, _ = self.detector.search(view, find_quads(part, halve=part.size > HALVE_FROM_PX) + box[0])
         return next((seen for seen in found if seen.marker_id == track.marker_id), None)
