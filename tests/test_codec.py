@@ -27,7 +27,7 @@ from schemas.codec import all_models, file_descriptor, proto_class, schema_name
 from tests.message_strategies import INT64, messages
 
 EVERY_MODEL = pytest.mark.parametrize("model", all_models(), ids=lambda model: model.__name__)
-UNHURRIED = settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
+UNHURRIED = settings(max_examples=30, suppress_health_check=list(HealthCheck))
 SQUARE = [Point2(x_px=x, y_px=y) for x, y in ((0, 0), (9, 0), (9, 9), (0, 9))]
 
 
