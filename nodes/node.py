@@ -23,11 +23,22 @@ def main(args: argparse.Namespace) -> None:
     if process.name == "source":
         _run_source(args, link, stop)
         return
-    mission = Mission() if args.mission is None else Mission.load(args.mission)
+    mission = _mission(args.mission)
     options = _options(args, mission, link)
     work = _work(args, options)
     with Bus(link, vehicle=mission.vehicle, node=process.name, lossless=options.lossless) as bus:
         Shell(process, work, options, bus, stop).run()
+
+
+def _mission(path: Path | None) -> Mission:
+    """Return the mission of a file, which may be a recording that carries one."""
+    if path is None:
+        return Mission()
+    if path.suffix == ".mcap":
+        from pipeline.recording import Recording
+
+        return Recording(path).mission
+    return Mission.load(path)
 
 
 def _options(args: argparse.Namespace, mission: Mission, link: Link) -> NodeOptions:
