@@ -50,7 +50,7 @@ def replay(args: argparse.Namespace) -> int:
     subject = _subject(source, args.recording)
     view = _view(args, console)
     speed = args.speed or (math.inf if view == "none" else 1.0)
-    _prepare(args.out)
+    _prepare(args.out, args.recording)
     _print_header(console, subject, args, view, f"speed {'max' if math.isinf(speed) else f'{speed:g}'}")
     if args.direct:
         outcome = _run_direct(args, source, view, speed, console)
@@ -83,7 +83,7 @@ def live(args: argparse.Namespace) -> int:
     subject = _subject(source, args.source)
     del source  # a camera is given back for the source node
     view = _view(args, console)
-    _prepare(args.out)
+    _prepare(args.out, args.source)
     own_link, node_link = _links(args.connect, args.listen)
     where = f"router {args.connect}" if args.connect else f"bus {args.listen}"
     _print_header(console, subject, args, view, where)
@@ -155,13 +155,17 @@ def _is_free(port: int) -> bool:
     return True
 
 
-def _prepare(out: Path) -> None:
+def _prepare(out: Path, spec: str) -> None:
     """Make the folder and take away the files of an earlier run, and only those."""
-    out.mkdir(parents=True, exist_ok=True)
-    for name in ("run.rrd", "summary.json", "report.png"):
-        (out / name).unlink(missing_ok=True)
-    for part in existing_parts(out):
-        part.unlink()
+    stale = [*existing_parts(out), *(out / name for name in ("run.rrd", "summary.json", "report.png"))]
+    if Path(spec).resolve() in [path.resolve() for path in stale]:
+        raise ValueError(f"{spec} would be overwritten by its own replay: choose another folder with --out")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for path in stale:
+            path.unlink(missing_ok=True)
+    except OSError as error:
+        raise ValueError(f"cannot write to {out}: {error.strerror}") from error
 
 
 def _links(connect: str | None, listen: str) -> tuple[Link, Link]:

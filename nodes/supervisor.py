@@ -109,7 +109,7 @@ class Supervisor:
     def run(self) -> Outcome:
         """Run to the end, or until the user stops it.  Raises RunError and BusError."""
         plan = self._plan
-        previous = {number: signal.signal(number, self._interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+        previous = {number: signal.signal(number, lambda *_: self.stop()) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
             with Bus(plan.own_link, vehicle=plan.vehicle, node="supervisor", lossless=plan.lossless) as bus:
                 bus.subscribe([STATE])
@@ -128,13 +128,14 @@ class Supervisor:
                 signal.signal(number, handler)
         return Outcome(completed=not self._interrupted.is_set(), died=frozenset(self._died))
 
+    def stop(self) -> None:
+        """End the run as Ctrl-C does; from a hook or another thread."""
+        self._interrupted.set()
+
     def pid(self, name: str) -> int | None:
         """Return a node's process id, None when it is not running."""
         child = self._children.get(name)
         return None if child is None else child.popen.pid
-
-    def _interrupt(self, *_: object) -> None:
-        self._interrupted.set()
 
     def _start(self, process: Process, *, died_s: float | None = None) -> None:
         plan = self._plan

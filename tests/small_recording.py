@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from numpy.typing import NDArray
 
 from astratag.camera import Camera
 from astratag.dictionary import load_dictionary
@@ -23,10 +25,25 @@ PERIOD_NS = 50_000_000
 MISSION = Mission(markers=(MarkerSection(id=7, side_m=0.1),))
 CAMERA = Camera([[600, 0, 319.5], [0, 600, 179.5], [0, 0, 1]], width=640, height=360)
 SPEED_M_S = 0.1
-"""Of the approach; the marker turns slowly as it comes."""
+"""Of the approach; the marker turns slowly, RATE_RAD_S, as it comes."""
+RATE_RAD_S = np.array([0.0, 0.0, 0.05])
 
 
-def write_small_recording(path: Path, *, frames: int, camera: Camera = CAMERA, samples: int = 2) -> Path:
+def marker_pose(range_m: float, t_s: float) -> NDArray[np.float64]:
+    """Return T_cam_marker."""
+    R_cam_marker = exp_so3((np.pi, 0, 0)) @ exp_so3((0.3, 0.2, 0.0)) @ exp_so3(RATE_RAD_S * t_s)
+    return pose(R_cam_marker, (0.01, -0.01, range_m))
+
+
+@cache
+def picture(range_m: float, t_s: float) -> bytes:
+    """Return the JPEG of one frame; rendered once for all tests of a session."""
+    signature = load_dictionary("astratag20").signature(7)
+    image = render_marker(CAMERA, marker_pose(range_m, t_s), signature=signature, side_m=0.1, samples=2)
+    return cv2.imencode(".jpg", image)[1].tobytes()
+
+
+def write_small_recording(path: Path, *, frames: int) -> Path:
     """Write ``frames`` frames at 20 Hz, ending 0.3 m from the marker."""
     with RecordingWriter(path, MISSION) as writer:
 
@@ -34,23 +51,18 @@ def write_small_recording(path: Path, *, frames: int, camera: Camera = CAMERA, s
             stamp = Stamp(k, START_NS + k * PERIOD_NS, 0)
             writer.write(Envelope.wrap(message, stamp, vehicle="chaser", camera="nav"), stamp.t_capture_ns)
 
-        write(calibration_message(camera, frame_id="nav", t_capture_ns=START_NS), 0)
+        write(calibration_message(CAMERA, frame_id="nav", t_capture_ns=START_NS), 0)
         for k in range(frames):
             t_s = k * PERIOD_NS * 1e-9
             range_m = 0.3 + SPEED_M_S * (frames * PERIOD_NS * 1e-9 - t_s)
-            rate_rad_s = np.array([0.0, 0.0, 0.05])
-            R_cam_marker = exp_so3((np.pi, 0, 0)) @ exp_so3((0.3, 0.2, 0.0)) @ exp_so3(rate_rad_s * t_s)
-            T_cam_marker = pose(R_cam_marker, (0.01, -0.01, range_m))
             truth = Truth(
                 t_capture_ns=START_NS + k * PERIOD_NS,
-                T_chaser_target=pose_message(T_cam_marker),
+                T_chaser_target=pose_message(marker_pose(range_m, t_s)),
                 v_chaser_target_m_s=vector_message((0, 0, -SPEED_M_S)),
-                omega_chaser_target_in_target_rad_s=vector_message(rate_rad_s),
+                omega_chaser_target_in_target_rad_s=vector_message(RATE_RAD_S),
             )
             write(truth, k)
-            signature = load_dictionary("astratag20").signature(7)
-            image = render_marker(camera, T_cam_marker, signature=signature, side_m=0.1, seed=k, samples=samples)
-            frame = CompressedImage(frame_id="nav", format="jpeg", data=cv2.imencode(".jpg", image)[1].tobytes())
+            frame = CompressedImage(frame_id="nav", format="jpeg", data=picture(range_m, t_s))
             frame.timestamp.FromNanoseconds(START_NS + k * PERIOD_NS)
             write(frame, k)
     return path

@@ -1,0 +1,89 @@
+"""One recording, three replays: over Zenoh by the command line, over Zenoh again, and direct: the same messages."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from nodes.bus import Link, free_endpoint
+from nodes.processes import PROCESSES
+from nodes.supervisor import Plan, Supervisor
+from pipeline.recording import Recording, RecordingWriter
+from pipeline.replay import REPEATABLE, differences, replay_direct
+from pipeline.sources import open_source
+from schemas.topics import CALIBRATION, DETECTIONS, FRAME, HEALTH, STATE, TRUTH
+from tests.small_recording import MISSION, write_small_recording
+
+FRAMES = 40
+
+
+def relnav(*arguments: str | Path, timeout_s: float = 120.0) -> subprocess.CompletedProcess[str]:
+    """Run the command line as a user does."""
+    command = [sys.executable, "-m", "nodes", *map(str, arguments)]
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=timeout_s, env=os.environ | {"COLUMNS": "120"}, check=False
+    )
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_small_recording(tmp_path_factory.mktemp("recording") / "small.mcap", frames=FRAMES)
+
+
+@pytest.fixture(scope="module")
+def by_command_line(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("command_line")
+    done = relnav("replay", recording, "--out", out, "--view", "none", "--speed", "max")
+    assert done.returncode == 0, done.stderr
+    assert f"{FRAMES} frames" in done.stdout
+    assert "try next" in done.stdout
+    assert done.stderr == ""
+    return out
+
+
+def test_the_results_are_all_there(by_command_line: Path):
+    names = {path.name for path in by_command_line.iterdir()}
+    assert names == {"run.mcap", "run.rrd", "summary.json", "report.png"}
+    summary = json.loads((by_command_line / "summary.json").read_text())
+    assert (summary["frames"], summary["frames_detected"], summary["dropped"]) == (FRAMES, FRAMES, 0)
+
+
+def test_nothing_is_lost(by_command_line: Path, recording: Path):
+    """Every frame, truth, detections and state is recorded, once; what came from the source, byte for byte."""
+    run, source = Recording(by_command_line / "run.mcap"), Recording(recording)
+    for topic in (FRAME, TRUTH, DETECTIONS, STATE):
+        sequences = [envelope.stamp.sequence for envelope, _ in run.envelopes([topic])]
+        assert sorted(sequences) == list(range(FRAMES)), topic.name
+    for topic in (CALIBRATION, FRAME, TRUTH):
+        recorded = [envelope.payload for envelope, _ in run.envelopes([topic])]
+        assert recorded == [envelope.payload for envelope, _ in source.envelopes([topic])], topic.name
+    assert {health.node for health in run.messages(HEALTH)} >= {process.name for process in PROCESSES[:3]}
+
+
+def test_two_replays_over_the_bus_are_identical(by_command_line: Path, recording: Path, tmp_path: Path):
+    """The second without a viewer."""
+    (tmp_path / "mission.json").write_text(MISSION.to_json())
+    endpoint = free_endpoint()
+    plan = Plan(
+        processes=tuple(process for process in PROCESSES if process.required),
+        arguments={"source": ["--source", str(recording), "--speed", "max"], "recorder": ["--out", str(tmp_path)]},
+        node_link=Link(endpoint, "peer"),
+        own_link=Link(endpoint, "hub"),
+        vehicle=MISSION.vehicle,
+        lossless=True,
+        mission_path=str(tmp_path / "mission.json"),
+    )
+    outcome = Supervisor(plan).run()
+    assert outcome.completed
+    assert not outcome.died
+    assert differences(by_command_line / "run.mcap", tmp_path / "run.mcap", REPEATABLE) == []
+
+
+def test_a_direct_replay_is_identical(by_command_line: Path, recording: Path, tmp_path: Path):
+    source = open_source(recording)
+    with RecordingWriter(tmp_path / "run.mcap", source.mission) as recorder:
+        replay_direct(source, [recorder])
+    assert differences(by_command_line / "run.mcap", tmp_path / "run.mcap", REPEATABLE) == []
