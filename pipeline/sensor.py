@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astratag.camera import Camera
-from pipeline.render import Image, srgb_from_linear
+from pipeline.render import srgb_from_linear
+from pipeline.texture import Image
 
 ADC_BITS = 12
 GLOW_SIGMA_PX = 14.0

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from astratag.camera import Camera
 from astratag.transforms import exp_so3, pose
-from pipeline.render import Image, Texture, print_texture
-from pipeline.scene import Body, Box, Material, Plate, Print, Tube
+from pipeline.bodies import Body, Box, Material, Plate, Print, Tube
+from pipeline.texture import Image, Texture, print_texture
 
 Array = NDArray[np.float64]
 Color = tuple[float, float, float]

@@ -16,7 +16,7 @@ from PIL import Image
 from astratag.artwork import CROP_MM, artwork_image, ink_outlines, write_artwork
 from astratag.dictionary import load_dictionary
 from astratag.geometry import LAYERS, QUIET_MARGIN, cell_polygons, layer_points, square
-from pipeline.render import print_coverage
+from pipeline.texture import print_coverage
 
 DICTIONARY = load_dictionary()
 SIDE_MM = 87.3

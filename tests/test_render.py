@@ -17,10 +17,10 @@ from pipeline.render import (
     WHITE_ALBEDO,
     lay_print,
     linear_from_srgb,
-    print_coverage,
     render_marker,
     srgb_from_linear,
 )
+from pipeline.texture import print_coverage
 
 REFERENCE = Path(__file__).parents[2] / "shared" / "reference"
 SIGNATURE = load_dictionary("astratag20").signature(7)

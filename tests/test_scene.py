@@ -10,9 +10,11 @@ from astratag.camera import Camera
 from astratag.dictionary import load_dictionary
 from astratag.surface import Cylinder
 from astratag.transforms import exp_so3, pose
-from pipeline.render import lay_print, print_texture, ray_lattice
+from pipeline.bodies import Body, Box, Material, Plate, Print, Tube
+from pipeline.render import lay_print, ray_lattice
 from pipeline.scenario import FACING
-from pipeline.scene import Body, Box, Material, Plate, Print, Scene, Sun, Tube, exposure_order
+from pipeline.scene import Scene, Sun, exposure_order
+from pipeline.texture import print_texture
 
 CAMERA = Camera([[400.0, 0.0, 158.0], [0.0, 402.0, 121.0], [0.0, 0.0, 1.0]], (-0.1, 0.05, 0, 0), width=320, height=240)
 BLACK_SKY = np.zeros((240, 320, 3), np.float32)
