@@ -19,8 +19,6 @@ from pathlib import Path
 from typing import IO, Any
 
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
-from google.protobuf.descriptor import Descriptor, FileDescriptor
-from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.data_stream import RecordBuilder
 from mcap.reader import SeekingReader
 from mcap.records import Attachment, Channel, Chunk, McapRecord, Message, Metadata, Schema
@@ -31,11 +29,13 @@ from mcap.writer import CompressionType, Writer
 from pipeline.foreign import CALIBRATION_SCHEMAS, IMAGE_SCHEMAS, standard_message
 from pipeline.mission import ATTACHMENT, Mission
 from schemas import Envelope, Stamp, Topic
-from schemas.codec import descriptor_of, schema_name
+from schemas.codec import descriptor_of, file_descriptor_set, schema_name
 from schemas.topics import CALIBRATION, FRAME, topic_for_key
 
 MAGIC = b"\x89MCAP0\r\n"
-CHUNK_BYTES = 4 << 20
+CHUNK_BYTES = 1 << 20
+MAX_SEQUENCE = 2**32 - 1
+MAX_NS = 2**63 - 1
 FLUSH_PERIOD_S = 0.25
 """A kill loses what is not flushed and, at worst, the chunk being written: twice this."""
 _FOOTER = struct.Struct("<xQQQI8s")
@@ -71,10 +71,13 @@ class RecordingWriter:
         self.close()
 
     def write(self, envelope: Envelope, t_receipt_ns: int) -> None:
-        """Take one envelope, received at UTC ``t_receipt_ns``."""
+        """Take one envelope, received at UTC ``t_receipt_ns``.  Raises ValueError for a stamp that MCAP cannot hold."""
         if not envelope.topic.recorded:
             return
         stamp = envelope.stamp
+        times_ns = (stamp.t_capture_ns, t_receipt_ns)
+        if not (0 <= stamp.sequence <= MAX_SEQUENCE and all(0 <= t_ns <= MAX_NS for t_ns in times_ns)):
+            raise ValueError(f"cannot record {envelope.key}: {stamp}, received {t_receipt_ns}, is out of MCAP's range")
         entered = envelope.topic is FRAME and stamp.t_origin_ns > 0
         with self._to_disk():
             self._mcap.add_message(
@@ -134,23 +137,6 @@ def _open_writer(file: IO[bytes]) -> Writer:
     writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE, enable_data_crcs=True)
     writer.start()
     return writer
-
-
-def file_descriptor_set(descriptor: Descriptor) -> bytes:
-    """Return a message's protobuf file and all it imports, imports first, as MCAP's protobuf schemas hold them."""
-    files = FileDescriptorSet()
-    added: set[str] = set()
-
-    def add(file: FileDescriptor) -> None:
-        if file.name in added:
-            return
-        added.add(file.name)
-        for dependency in file.dependencies:
-            add(dependency)
-        file.CopyToProto(files.file.add())
-
-    add(descriptor.file)
-    return files.SerializeToString(deterministic=True)
 
 
 @dataclass(frozen=True)

@@ -119,6 +119,23 @@ def schema_name(schema: Any) -> str:
     return descriptor_of(schema).full_name
 
 
+def file_descriptor_set(descriptor: Descriptor) -> bytes:
+    """Return a message's protobuf file and all it imports, imports first, as readers of recordings want them."""
+    files = descriptor_pb2.FileDescriptorSet()
+    added: set[str] = set()
+
+    def add(file: FileDescriptor) -> None:
+        if file.name in added:
+            return
+        added.add(file.name)
+        for dependency in file.dependencies:
+            add(dependency)
+        file.CopyToProto(files.file.add())
+
+    add(descriptor.file)
+    return files.SerializeToString(deterministic=True)
+
+
 def encode(message: AnyMessage) -> bytes:
     """Return the protobuf bytes of a message; equal messages give equal bytes."""
     if isinstance(message, Message):

@@ -22,9 +22,9 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from pipeline.mission import Mission
-from pipeline.recording import MAGIC, Recording, RecordingError, RecordingWriter, file_descriptor_set, recover
+from pipeline.recording import MAGIC, Recording, RecordingError, RecordingWriter, recover
 from schemas import Envelope, Mode, RelativeState, Stamp, decode
-from schemas.codec import descriptor_of
+from schemas.codec import descriptor_of, file_descriptor_set
 from schemas.topics import CALIBRATION, EVENTS, FRAME, STATE, TOPICS, TRUTH
 from tests.small_run import MISSION, START_NS, image_message, run_envelopes, wrap, write_run
 
@@ -392,3 +392,14 @@ def test_messages_of_topics_that_are_not_recorded_stay_out(tmp_path: Path) -> No
     with RecordingWriter(tmp_path / "x.mcap", MISSION) as writer:
         writer.write(replace(envelope, topic=replace(STATE, recorded=False)), 1)
     assert Recording(tmp_path / "x.mcap").message_count == 0
+
+
+@pytest.mark.parametrize("stamp", [Stamp(-1, 1, 1), Stamp(2**32, 1, 1), Stamp(0, -1, 1)])
+def test_a_stamp_that_cannot_be_recorded_is_refused_and_harms_nothing(tmp_path: Path, stamp: Stamp) -> None:
+    state = RelativeState(t_capture_ns=1, mode=Mode.INIT)
+    with RecordingWriter(tmp_path / "x.mcap", MISSION) as writer:
+        writer.write(wrap(state, Stamp(0, 1, 1)), 1)
+        with pytest.raises(ValueError, match=r"cannot record relnav/probe/state: .* is out of MCAP's range"):
+            writer.write(wrap(state, stamp), 1)
+        writer.write(wrap(state, Stamp(1, 2, 2)), 2)
+    assert [row[2] for row in plain(Recording(tmp_path / "x.mcap"))] == [0, 1]
