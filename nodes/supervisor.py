@@ -16,6 +16,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from nodes.bus import Bus, Credit, Link, Presence, Received
 from nodes.processes import Process
@@ -31,6 +32,9 @@ RESTART_MEMORY_S = 30.0
 ERROR_PREFIX = "relnav: error: "
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
 """Nodes are parallel by being processes."""
+NODES = (sys.executable, "-P", "-m", "nodes")
+"""The command line of the very code that runs here, whatever lies in the user's folder."""
+ROOT = Path(__file__).resolve().parent.parent
 
 
 class RunError(ValueError):
@@ -83,6 +87,15 @@ class Child:
     """When the one before it died, until it has announced itself."""
     ended: bool = False
     lines: deque[str] = field(default_factory=lambda: deque(maxlen=50))
+    reader: threading.Thread | None = None
+
+    def close_pipes(self) -> None:
+        """Read its last lines and let go of it; to be called when it has ended."""
+        if self.reader is not None:
+            self.reader.join(1.0)
+        for pipe in (self.popen.stdin, self.popen.stderr):
+            if pipe is not None:
+                pipe.close()
 
     def epitaph(self) -> str:
         """Return in a few words why it is no more."""
@@ -139,7 +152,7 @@ class Supervisor:
 
     def _start(self, process: Process, *, died_s: float | None = None) -> None:
         plan = self._plan
-        command = [sys.executable, "-m", "nodes", "node", process.name, "--supervised", "--mission", plan.mission_path]
+        command = [*NODES, "node", process.name, "--supervised", "--mission", plan.mission_path]
         command += ["--connect" if plan.node_link.role == "client" else "--hub", plan.node_link.endpoint]
         if plan.lossless:
             command += ["--lossless", "--companions", ",".join(p.name for p in plan.processes if p.name != "source")]
@@ -154,12 +167,13 @@ class Supervisor:
             stderr=subprocess.PIPE,
             text=True,
             errors="replace",
-            env=os.environ | ONE_THREAD,
+            env=_environment(),
             start_new_session=True,  # a Ctrl-C is for us: we stop the nodes in order
         )
         child = Child(process, popen, died_s=died_s)
         self._children[process.name] = child
-        threading.Thread(target=self._read_lines, args=(child,), daemon=True).start()
+        child.reader = threading.Thread(target=self._read_lines, args=(child,), daemon=True)
+        child.reader.start()
 
     def _read_lines(self, child: Child) -> None:
         assert child.popen.stderr is not None
@@ -205,7 +219,7 @@ class Supervisor:
         name, now_s = child.process.name, time.monotonic()
         del self._children[name]
         self._died.add(name)
-        _join_pipes(child)
+        child.close_pipes()
         why = child.epitaph()
         if self._plan.lossless:
             if child.process.required:
@@ -254,7 +268,7 @@ class Supervisor:
                     child.popen.kill()
                     child.popen.wait()
                     self._hooks.on_note(f"warning: the {child.process.name} did not stop when told and was killed")
-                _join_pipes(child)
+                child.close_pipes()
 
     def _empty(self, bus: Bus) -> None:
         while (event := bus.mailbox.get(0.0)) is not None:
@@ -262,6 +276,6 @@ class Supervisor:
                 self._show(event)
 
 
-def _join_pipes(child: Child) -> None:
-    if child.popen.stdin is not None:
-        child.popen.stdin.close()
+def _environment() -> dict[str, str]:
+    path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    return os.environ | ONE_THREAD | {"PYTHONPATH": path}
