@@ -1,5 +1,6 @@
 """The AstraTag marker: geometry, codes, artwork, camera model, detection and pose.  Knows no transport."""
 
+from astratag.annotate import annotate
 from astratag.camera import Camera
 from astratag.detection import Detection, LayerDetection, PlanarPose
 from astratag.detector import Detector, MarkerSpec
@@ -19,5 +20,6 @@ __all__ = [
     "PlanarPose",
     "Surface",
     "Tracker",
+    "annotate",
     "load_dictionary",
 ]

@@ -170,7 +170,8 @@ class Detector:
             method = "cylinder" if fit.warp.curved else "planar"
         else:
             method = "tps" if candidate.bent or _bend_fraction(fit.warp) > NOTICEABLE_BEND else "planar"
-        return self.describe(view, marker_id, fit, method)
+        detection = self.describe(view, marker_id, fit, method)
+        return detection if detection is None else self._with_other_pose(view, detection, fit)
 
     def _fit(self, view: View, candidate: Candidate, layer: int) -> Fit | None:
         """Return the fit of a whole marker begun at one layer, None as soon as its code is not read there."""
@@ -179,26 +180,25 @@ class Detector:
         if candidate.bent and starts and isinstance(starts[0], BentWarp):
             return grow(view.light, starts[0], layer)
         own = (fit_own_edges(view.light, start, layer) for start in starts)
-        begun = min((fit for fit in own if fit is not None), key=lambda fit: fit.cost, default=None)
+        begun = next((fit for fit in own if fit is not None), None)
         if begun is None:
             return None
         cells = layer_cells(view.gray, begun.warp, layer)
         if self._codebook.read_as(cells, marker_id).correlation < PROMISING:
             return None
-        fit = grow(view.light, begun.warp, layer)
-        return fit if fit is None else self._other_pose(view, fit)
+        return grow(view.light, begun.warp, layer)
 
-    def _other_pose(self, view: View, fit: Fit) -> Fit:
-        """Return the fit begun again from the other of two planar poses when that explains the corners better."""
-        warp = fit.warp
-        layers = measure_layers(fit, view.gray.shape)
-        if not isinstance(warp, PoseWarp) or not layers:
-            return fit
-        poses = planar_poses(warp.camera, layers, warp.side_m, warp.surface)
-        if not poses or poses[0].reprojection_rms_px > OTHER_POSE_GAIN * _corner_rms(warp, layers):
-            return fit
-        again = settle(view.light, replace(warp, T_cam_marker=poses[0].T_cam_marker))
-        return again if again is not None and again.cost < fit.cost else fit
+    def _with_other_pose(self, view: View, detection: Detection, fit: Fit) -> Detection:
+        """Return the detection fitted again from the other planar pose when that explains its corners better."""
+        poses, rms_px = detection.planar_poses, detection.reprojection_rms_px
+        if not isinstance(fit.warp, PoseWarp) or not poses or rms_px is None:
+            return detection
+        if poses[0].reprojection_rms_px > OTHER_POSE_GAIN * rms_px:
+            return detection
+        again = settle(view.light, replace(fit.warp, T_cam_marker=poses[0].T_cam_marker))
+        if again is None or again.cost >= fit.cost:
+            return detection
+        return self.describe(view, detection.marker_id, again, detection.method) or detection
 
     def _starts(self, view: View, candidate: Candidate, layer: int) -> Iterator[FittedWarp]:
         """Yield warps to start fitting from when the candidate is ``layer`` of its marker."""
@@ -247,15 +247,20 @@ class Detector:
         )
 
     def _read_through(self, view: View, warp: FittedWarp, marker_id: int) -> Reading | None:
-        """Return the best reading of one identity among the layers that are whole in the image and large enough."""
+        """Return the best reading of one identity among the layers that are whole in the image.
+
+        The larger layers come first, and one that is sure will do.
+        """
         height, width = view.gray.shape
-        readings = []
+        best: Reading | None = None
         for layer in LAYERS:
             corners = warp(square(*layer.black))
-            if (corners < 0).any() or (corners > (width - 1, height - 1)).any():
-                continue
-            readings.append(self._codebook.read_as(layer_cells(view.gray, warp, layer.index), marker_id))
-        return max(readings, key=lambda r: r.correlation, default=None)
+            if (corners >= 0).all() and (corners <= (width - 1, height - 1)).all():
+                reading = self._codebook.read_as(layer_cells(view.gray, warp, layer.index), marker_id)
+                best = reading if best is None or reading.correlation > best.correlation else best
+                if best.correlation >= SURE:
+                    break
+        return best
 
 
 def _bend_fraction(warp: FittedWarp) -> float:

@@ -21,7 +21,7 @@ Mask = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 Transfer = Literal["srgb", "linear"]
 
-POINTS_PER_EDGE = 32
+POINTS_PER_EDGE = 24
 END_MARGIN = 0.08
 """Fraction of an edge left out at either end, where corners are round and blurred."""
 STEP_PX = 0.5
@@ -69,7 +69,7 @@ EDGES = _edges()
 ALONG = np.linspace(END_MARGIN, 1 - END_MARGIN, POINTS_PER_EDGE)
 _STARTS, _ENDS = np.array([e.start for e in EDGES]), np.array([e.end for e in EDGES])
 EDGE_POINTS = _STARTS[:, None, :] + ALONG[None, :, None] * (_ENDS - _STARTS)[:, None, :]
-"""Sampling points (20, 32, 2), template units."""
+"""Sampling points (20, 24, 2), template units."""
 EDGE_LAYER = np.array([e.layer for e in EDGES])
 EDGE_IS_FRAME = np.array([e.frame for e in EDGES])
 EDGE_REACH = np.array([e.reach for e in EDGES])
@@ -146,8 +146,8 @@ def locate(light: NDArray[np.float32], warp: FittedWarp, edges: NDArray[np.int64
         light, at.reshape(-1, len(steps), 2), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     ).reshape(at.shape[:3])
     offset, rise = _steepest_rise(profile, np.minimum(search_px, 0.6 * reach_px))
-    visible = warp.visible(template.reshape(-1, 2)).reshape(template.shape[:2])
-    in_view = inside & visible
+    visible = warp.visible(template[:, _FEW].reshape(-1, 2)).reshape(-1, len(_FEW)).all(axis=1)
+    in_view: Mask = inside & np.asarray(visible)[:, None]
     typical = np.maximum(rise, 0.0).mean(axis=1, keepdims=True)
     found = in_view & np.isfinite(offset) & (rise > np.maximum(LEAST_RISE * typical, LEAST_RISE_GREY))
     return EdgePoints(edges, predicted, normal, np.where(found, offset, 0.0), found, in_view, length_px, reach_px)

@@ -29,9 +29,7 @@ def layer_side_px(warp: FittedWarp, layer: int) -> float:
 
 def fit_own_edges(light: Light, warp: FittedWarp, layer: int) -> Fit | None:
     """Return a warp that is right to a few pixels fitted to the edges of one layer, None when they are not there."""
-    own = ALL_EDGES[layer == EDGE_LAYER]
-    first = fit_edges(light, warp, own, _search_px(warp, layer, 0.03))
-    return None if first is None else fit_edges(light, first.warp, own, SETTLE_PX)
+    return fit_edges(light, warp, ALL_EDGES[layer == EDGE_LAYER], _search_px(warp, layer, 0.03))
 
 
 def grow(light: Light, warp: FittedWarp, layer: int) -> Fit | None:

@@ -24,7 +24,9 @@ SEARCH_EVERY = 10
 """Frames between searches of the whole image for markers not yet tracked."""
 TRACK_PX = 6.0
 """How far from its prediction an edge may be."""
-COST_LIMIT = 3.0
+CLOSE_PX = 0.7
+"""A fit that moved its edges less than this needs no second one."""
+COST_LIMIT = 1.0
 """Mean truncated squared residual (of 9 at most) above which a followed fit is not believed."""
 LEAST_BOX_PX = 16
 LOCAL_MARGIN = 0.5
@@ -120,8 +122,10 @@ class Tracker:
         warp: FittedWarp = PoseWarp(view.camera, spec.side_m, spec.surface or Flat(), T_cam_marker)
         if spec.surface is None:
             return grow(view.light, HomographyWarp.from_points(OUTER, warp(OUTER)), 0)
-        fit = fit_edges(view.light, warp, ALL_EDGES, TRACK_PX)
-        return None if fit is None else settle(view.light, fit.warp)
+        fit = fit_edges(view.light, warp, ALL_EDGES, TRACK_PX, sharp_only=True)
+        if fit is None or np.abs(fit.offset_px[fit.weight > 0]).max(initial=0.0) < CLOSE_PX:
+            return fit
+        return settle(view.light, fit.warp)
 
     def _search_near(self, view: View, track: Track, box: NDArray[np.int64]) -> Detection | None:
         """Return a lost marker from a search of the part of the image it should be in."""
