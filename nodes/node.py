@@ -54,6 +54,7 @@ def _run_source(args: argparse.Namespace, link: Link, stop: StopSignal) -> None:
     source = open_source(
         args.source, camera=args.camera, mission=args.mission, fps=args.fps, scale_camera=args.scale_camera
     )
+    source.on_warning = _warn
     options = _options(args, source.mission, link)
     pace = Pace(speed=None if math.isinf(args.speed) else args.speed, loop=args.loop, resume=_resume(args.resume))
     with Bus(link, vehicle=source.mission.vehicle, node="source", lossless=options.lossless) as bus:
@@ -84,10 +85,15 @@ def _work(args: argparse.Namespace, options: NodeOptions) -> Work:
             web_port=args.web_port,
             grpc_port=args.grpc_port,
             host=args.bind,
-            warn=lambda text: print(f"relnav: warning: {text}", file=sys.stderr, flush=True),
+            warn=_warn,
         )
         return ViewerWork(viewer)
     from nodes.step_host import StepWork
 
     spec = next(spec for spec in STEPS if spec.name == args.name)
     return StepWork(spec, options.mission, lossless=options.lossless)
+
+
+def _warn(text: str) -> None:
+    """Tell the supervisor, which shows what its children print to standard error."""
+    print(f"relnav: warning: {text}", file=sys.stderr, flush=True)

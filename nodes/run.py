@@ -235,6 +235,7 @@ def _run_direct(args: argparse.Namespace, source: Source, view: View, speed: flo
                 warn=lambda text: progress.on_note(f"warning: {text}"),
             )
         )
+        source.on_warning = lambda text: progress.on_note(f"warning: {text}")
         try:
             replay_direct(source, [recorder, viewer], speed="max" if math.isinf(speed) else speed)
         except KeyboardInterrupt:

@@ -33,6 +33,8 @@ ASSUMED_FIELD_OF_VIEW_RAD = np.deg2rad(60.0)
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 PASSED_ON = {b"\x89PNG": "png", b"\xff\xd8\xff": "jpeg"}
 """Files that begin like this are passed on as they are; others become PNG."""
+NAMED = 10
+"""Images skipped beyond these are only counted."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +60,7 @@ class PictureSource(Source):
         calibration = calibration_message(camera, frame_id=mission.camera.name, t_capture_ns=t_start_ns)
         super().__init__(mission, calibration, frame_count)
         if assumed:
-            self._warn(
-                "no camera calibration given: a lens of 60 degrees is assumed, so ranges are not to scale"
-            )
+            self._warn("no camera calibration given: a lens of 60 degrees is assumed, so ranges are not to scale")
 
     @abstractmethod
     def pictures(self) -> Iterator[Picture]:
@@ -99,7 +99,10 @@ class FolderSource(PictureSource):
                 yield picture
             else:
                 self.skipped += 1
-                self._warn(f"skipped {path}: it {picture}")
+                if self.skipped <= NAMED:
+                    self._warn(f"skipped {path}: it {picture}")
+        if self.skipped:
+            self._warn(f"{self.skipped} of {len(self._paths)} images were skipped")
 
 
 def _read(path: Path, t_capture_ns: int) -> Picture | str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,7 +40,7 @@ class Source(ABC):
     """Frames in order, with what is known about their camera.
 
     ``frame_count`` is None when live.  While ``envelopes`` is drawn, ``skipped`` counts images that cannot be used,
-    ``backwards`` frames captured before their predecessor, and ``warnings`` may grow.
+    ``backwards`` frames captured before their predecessor, and ``warnings`` may grow: ``on_warning`` hears of it.
     """
 
     live = False
@@ -50,6 +50,7 @@ class Source(ABC):
         self.calibration = calibration
         self.frame_count = frame_count
         self.warnings: list[str] = []
+        self.on_warning: Callable[[str], object] = lambda line: None
         self.skipped = 0
         self.backwards = 0
 
@@ -60,6 +61,7 @@ class Source(ABC):
     def _warn(self, line: str) -> None:
         if line not in self.warnings:
             self.warnings.append(line)
+            self.on_warning(line)
 
     def _envelope(self, topic: Topic, payload: bytes, stamp: Stamp) -> Envelope:
         key = topic.key(vehicle=self.mission.vehicle, camera=self.mission.camera.name)

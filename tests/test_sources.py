@@ -11,7 +11,7 @@ from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
 from astratag.camera import Camera
-from pipeline.camera_device import Grabbed, capture_time_ns
+from pipeline.camera_device import Grabbed, OpenCvDevice, capture_time_ns
 from pipeline.convert import calibration_message, camera_from_calibration
 from pipeline.mission import CameraSection, Mission
 from pipeline.picture_sources import EPOCH_NS, CameraSource, assumed_camera
@@ -227,15 +227,22 @@ def test_broken_images_are_skipped_counted_and_named(folder: Path) -> None:
     (folder / "frame_3.png").write_bytes(b"")
     cv2.imwrite(str(folder / "frame_5.png"), gray(5, width=80))
     source = open_source(folder, fps=10)
+    heard: list[str] = []
+    source.on_warning = heard.append
     frames = frames_of(source)
     assert [e.stamp.sequence for e in frames] == list(range(9))
     assert [(e.stamp.t_capture_ns - EPOCH_NS) // 100_000_000 for e in frames] == [1, 2, 4, 6, 7, 8, 9, 10, 11]
     assert source.skipped == 3
-    assert [w for w in source.warnings if "skipped" in w] == [
-        f"skipped {folder / 'frame_0.png'}: it is not an image that can be decoded",
-        f"skipped {folder / 'frame_3.png'}: it is not an image that can be decoded",
-        f"skipped {folder / 'frame_5.png'}: it is 80x120, the first one 160x120",
-    ]
+    assert (
+        heard
+        == source.warnings[1:]
+        == [
+            f"skipped {folder / 'frame_0.png'}: it is not an image that can be decoded",
+            f"skipped {folder / 'frame_3.png'}: it is not an image that can be decoded",
+            f"skipped {folder / 'frame_5.png'}: it is 80x120, the first one 160x120",
+            "3 of 12 images were skipped",
+        ]
+    )
 
 
 @pytest.mark.parametrize(("suffix", "kind"), [(".jpg", "jpeg"), (".png", "png"), (".bmp", "png"), (".tif", "png")])
@@ -348,6 +355,51 @@ def test_a_driver_stamp_that_cannot_be_believed_gives_way_to_the_receipt(t_drive
     assert capture_time_ns(grabbed) == START_NS
     in_the_future = replace(grabbed, t_driver_ms=9_001.0)
     assert capture_time_ns(in_the_future) == START_NS
+
+
+class FakeCapture:
+    """What OpenCV says of a V4L2 camera in manual exposure, 100 units of 100 us; it has two frames."""
+
+    settings: dict[int, float]
+
+    def __init__(self, index: int, backend: int):
+        FakeCapture.settings = {}
+        assert (index, backend) == (2, cv2.CAP_V4L2)
+        self._left = 2
+
+    def isOpened(self) -> bool:  # noqa: N802
+        """Say yes."""
+        return True
+
+    def set(self, setting: int, value: float) -> None:
+        """Remember what was asked for."""
+        FakeCapture.settings[setting] = value
+
+    def get(self, setting: int) -> float:
+        """Answer."""
+        return {cv2.CAP_PROP_AUTO_EXPOSURE: 1.0, cv2.CAP_PROP_EXPOSURE: 100.0, cv2.CAP_PROP_POS_MSEC: 5.5}[setting]
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        """Return a frame, None when there are no more."""
+        self._left -= 1
+        return self._left >= 0, cv2.cvtColor(gray(0), cv2.COLOR_GRAY2BGR) if self._left >= 0 else None
+
+    def release(self) -> None:
+        """Do nothing."""
+
+
+def test_a_v4l2_camera_by_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pipeline.camera_device.cv2.VideoCapture", FakeCapture)
+    source = open_source("v4l2:/dev/video2", fps=20)
+    assert isinstance(source, CameraSource)
+    assert FakeCapture.settings == {cv2.CAP_PROP_BUFFERSIZE: 1, cv2.CAP_PROP_FPS: 20}
+    with pytest.raises(ValueError, match=r"camera /dev/video2 stopped giving frames: was it unplugged\?"):
+        frames_of(source)
+    monkeypatch.setattr("pipeline.camera_device.time.time_ns", lambda: START_NS)
+    monkeypatch.setattr("pipeline.camera_device.time.monotonic_ns", lambda: 9_500_000)
+    grabbed = OpenCvDevice(2).grab()
+    assert grabbed.exposure_s == pytest.approx(0.010)
+    assert capture_time_ns(grabbed) == START_NS - 4_000_000 + 5_000_000
 
 
 # What is not there
