@@ -78,16 +78,18 @@ def print_coverage(signature: NDArray[np.uint8], texels_per_unit: int = TEXELS_P
 
 def _paint_square(white: Image, centres: Array, layer: Layer, texels_per_unit: int) -> None:
     """Lay a layer's white frame, its outer corners rounded, and the black square inside it."""
+    near, far = layer.black if layer.frame is None else layer.frame
+    part = slice(*np.searchsorted(centres, (near - 1, far + 1)))
+    white, at = white[part, part], centres[part].astype(np.float32)
     if layer.frame is not None:
-        near, far = layer.frame
         radius = layer.frame_corner_radius
-        beyond = np.abs(centres - (near + far) / 2) - ((far - near) / 2 - radius)
+        beyond = np.abs(at - (near + far) / 2) - ((far - near) / 2 - radius)
         outside = np.hypot(np.maximum(beyond[:, None], 0), np.maximum(beyond[None, :], 0))
         inside = radius - outside - np.minimum(np.maximum(beyond[:, None], beyond[None, :]), 0)
         np.maximum(white, np.clip(inside * texels_per_unit + 0.5, 0, 1), out=white)
     near, far = layer.black
-    along = np.clip((np.minimum(centres - near, far - centres)) * texels_per_unit + 0.5, 0, 1)
-    white *= 1 - (along[:, None] * along[None, :]).astype(np.float32)
+    along = np.clip(np.minimum(at - near, far - at) * texels_per_unit + 0.5, 0, 1)
+    white *= 1 - along[:, None] * along[None, :]
 
 
 def _add_triangle(white: Image, centres: Array, corners: Array, texels_per_unit: int) -> None:
