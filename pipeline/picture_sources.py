@@ -19,7 +19,7 @@ from pipeline.camera_device import CameraDevice, capture_time_ns
 from pipeline.convert import NS_PER_S, calibration_message
 from pipeline.mission import Mission
 from pipeline.opencv_log import quiet_opencv
-from pipeline.source import Source, SourceError, SourceOptions, decoded, load_camera
+from pipeline.source import PNG, Source, SourceError, SourceOptions, decoded, load_camera
 from schemas import Envelope, Stamp, encode
 from schemas.topics import CALIBRATION, FRAME
 
@@ -31,7 +31,7 @@ VIDEO_FPS = 30.0
 JPEG_QUALITY = 95
 ASSUMED_FIELD_OF_VIEW_RAD = np.deg2rad(60.0)
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
-PASSED_ON = {b"\x89PNG": "png", b"\xff\xd8\xff": "jpeg"}
+PASSED_ON = {PNG: "png", b"\xff\xd8\xff": "jpeg"}
 """Files that begin like this are passed on as they are; others become PNG."""
 NAMED = 10
 """Images skipped beyond these are only counted."""

@@ -17,6 +17,10 @@ from pipeline.mission import Mission
 from pipeline.opencv_log import quiet_opencv
 from schemas import Envelope, Stamp, Topic
 
+PNG = b"\x89PNG"
+PNG_END = b"IEND\xaeB`\x82"
+"""Looked for before decoding: libpng itself prints about its absence, past OpenCV."""
+
 
 class SourceError(ValueError):
     """A source that cannot be opened, in one line."""
@@ -76,6 +80,8 @@ def load_camera(options: SourceOptions, width: int, height: int) -> Camera | Non
 
 
 def decoded(data: bytes) -> NDArray[np.uint8] | None:
-    """Return the image (height, width, 3) in encoded bytes, None when there is none."""
+    """Return the image (height, width, 3) in encoded bytes, None when there is none or it is cut off."""
+    if not data or (data.startswith(PNG) and PNG_END not in data):
+        return None
     with quiet_opencv():
-        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)

@@ -220,7 +220,7 @@ def test_two_replays_of_a_folder_are_identical(folder: Path) -> None:
     assert list(open_source(folder).envelopes()) == list(open_source(folder).envelopes())
 
 
-def test_broken_images_are_skipped_counted_and_named(folder: Path) -> None:
+def test_broken_images_are_skipped_counted_and_named(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """A gap in time, none in the numbering."""
     whole = (folder / "frame_0.png").read_bytes()
     (folder / "frame_0.png").write_bytes(whole[: len(whole) // 2])
