@@ -150,11 +150,14 @@ class Bus:
             publisher = self._publishers[envelope.key] = self._declare_publisher(envelope.topic, envelope.key)
         publisher.put(envelope.payload, attachment=envelope.stamp.pack())
 
-    def subscribe(self, topics: Iterable[Topic], *, camera: str = "*") -> None:
-        """Have the topics' envelopes put in the mailbox; of latched topics, the last value at once."""
+    def subscribe(self, topics: Iterable[Topic], *, camera: str = "*", keep_all: bool = False) -> None:
+        """Have the topics' envelopes put in the mailbox; of latched topics, the last value at once.
+
+        ``keep_all``: every frame of a live run too, not only the newest.
+        """
         for topic in topics:
             key = topic.key(vehicle=self._vehicle, camera=camera)
-            newest_wins = topic.newest_wins and not self._lossless
+            newest_wins = topic.newest_wins and not self._lossless and not keep_all
 
             def on_sample(sample: zenoh.Sample, topic: Topic = topic, newest_wins: bool = newest_wins) -> None:
                 self._receive(topic, sample, newest_wins=newest_wins)

@@ -14,13 +14,15 @@ class Process:
     """One row of the table.
 
     ``required``: a replay ends with an error when it dies; an optional one is merely missed.  In a live run
-    either is started again.
+    either is started again.  ``keeps_all``: it takes every frame of a live run too, however late, where others
+    skip to the newest.
     """
 
     name: str
     consumes: tuple[Topic, ...]
     publishes: tuple[Topic, ...]
     required: bool = True
+    keeps_all: bool = False
 
     @property
     def paced_by(self) -> tuple[Topic, ...]:
@@ -33,7 +35,7 @@ _RECORDED = tuple(topic for topic in TOPICS if topic.recorded)
 PROCESSES = (
     Process("source", (), (CALIBRATION, TRUTH, FRAME)),
     *(Process(spec.name, spec.consumes, spec.produces) for spec in STEPS),
-    Process("recorder", _RECORDED, ()),
+    Process("recorder", _RECORDED, (), keeps_all=True),
     Process("viewer", _RECORDED, (), required=False),
 )
 """In the order of the data: each process consumes only what those before it publish, and everybody's health."""

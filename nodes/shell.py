@@ -113,7 +113,7 @@ class Shell:
     def run(self) -> None:
         """Work until stopped.  Raises NodeError when messages of a replay are lost."""
         mission, lossless = self._options.mission, self._options.lossless
-        self._bus.subscribe(self._process.consumes, camera=mission.camera.name)
+        self._bus.subscribe(self._process.consumes, camera=mission.camera.name, keep_all=self._process.keeps_all)
         self._bus.watch(sorted(self._awaited | self._producers))
         announced = False
         join_deadline_s = time.monotonic() + JOIN_PATIENCE_S

@@ -254,13 +254,14 @@ class Supervisor:
         return time_up or (source is not None and source.ended)
 
     def _stop(self) -> None:
-        """Stop those who speak before those who listen, so that nothing said is lost."""
-        speakers = [child for child in self._children.values() if child.process.publishes]
-        listeners = [child for child in self._children.values() if not child.process.publishes]
-        for group, patience_s in ((speakers, STOP_PATIENCE_S), (listeners, FINISH_PATIENCE_S)):
+        """Stop who speaks before who listens, in the order of the data, so that nothing said is lost."""
+        children = [self._children[p.name] for p in self._plan.processes if p.name in self._children]
+        speakers = [[child] for child in children if child.process.publishes]
+        listeners = [child for child in children if not child.process.publishes]
+        for group in [*speakers, listeners]:
             for child in group:
                 child.popen.send_signal(signal.SIGTERM)
-            deadline_s = time.monotonic() + patience_s
+            deadline_s = time.monotonic() + (FINISH_PATIENCE_S if group is listeners else STOP_PATIENCE_S)
             for child in group:
                 try:
                     child.popen.wait(max(deadline_s - time.monotonic(), 0.01))

@@ -1,4 +1,4 @@
-"""A small recording for the tests of the nodes: a flat marker comes in, with truth, in pictures cheap to make."""
+"""A small recording for the tests of the nodes, and runs of it: a flat marker comes in, in pictures cheap to make."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 from astratag.camera import Camera
 from astratag.dictionary import load_dictionary
 from astratag.transforms import exp_so3, pose
+from nodes.bus import Link, free_endpoint
+from nodes.processes import PROCESSES
+from nodes.supervisor import Plan
 from pipeline.convert import calibration_message, pose_message, vector_message
 from pipeline.mission import MarkerSection, Mission
 from pipeline.recording import RecordingWriter
@@ -66,3 +69,24 @@ def write_small_recording(path: Path, *, frames: int) -> Path:
             frame.timestamp.FromNanoseconds(START_NS + k * PERIOD_NS)
             write(frame, k)
     return path
+
+
+def plan(recording: Path, out: Path, *, lossless: bool, speed: str = "1", viewer: bool = False) -> Plan:
+    """Return the plan of a run of the recording into ``out``."""
+    out.mkdir(parents=True, exist_ok=True)
+    mission_path = out / "mission.json"
+    mission_path.write_text(MISSION.to_json())
+    endpoint = free_endpoint()
+    return Plan(
+        processes=tuple(process for process in PROCESSES if process.required or viewer),
+        arguments={
+            "source": ["--source", str(recording), "--speed", speed],
+            "recorder": ["--out", str(out)],
+            "viewer": ["--out", str(out)],
+        },
+        node_link=Link(endpoint, "peer"),
+        own_link=Link(endpoint, "hub"),
+        vehicle=MISSION.vehicle,
+        lossless=lossless,
+        mission_path=str(mission_path),
+    )

@@ -8,14 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from nodes.bus import Link, free_endpoint
 from nodes.processes import PROCESSES
-from nodes.supervisor import Plan, Supervisor
+from nodes.supervisor import Supervisor
 from pipeline.recording import Recording, RecordingWriter
 from pipeline.replay import REPEATABLE, differences, replay_direct
 from pipeline.sources import open_source
 from schemas.topics import CALIBRATION, DETECTIONS, FRAME, HEALTH, STATE, TRUTH
-from tests.small_recording import MISSION, write_small_recording
+from tests.small_recording import plan, write_small_recording
 
 FRAMES = 40
 
@@ -65,18 +64,7 @@ def test_nothing_is_lost(by_command_line: Path, recording: Path):
 
 def test_two_replays_over_the_bus_are_identical(by_command_line: Path, recording: Path, tmp_path: Path):
     """The second without a viewer."""
-    (tmp_path / "mission.json").write_text(MISSION.to_json())
-    endpoint = free_endpoint()
-    plan = Plan(
-        processes=tuple(process for process in PROCESSES if process.required),
-        arguments={"source": ["--source", str(recording), "--speed", "max"], "recorder": ["--out", str(tmp_path)]},
-        node_link=Link(endpoint, "peer"),
-        own_link=Link(endpoint, "hub"),
-        vehicle=MISSION.vehicle,
-        lossless=True,
-        mission_path=str(tmp_path / "mission.json"),
-    )
-    outcome = Supervisor(plan).run()
+    outcome = Supervisor(plan(recording, tmp_path, lossless=True, speed="max")).run()
     assert outcome.completed
     assert not outcome.died
     assert differences(by_command_line / "run.mcap", tmp_path / "run.mcap", REPEATABLE) == []
