@@ -1,7 +1,7 @@
 """Render the shipped approach-corridor recording: ``.venv/bin/python recordings/make_corridor.py [FILE]``.
 
 A chaser brakes from 1.5 m to 6 cm before a slowly tumbling station module with one marker.  Every picture, its truth,
-the calibration and the mission go into one MCAP file.  The same seed gives the same file, whatever the processes.
+the calibration and the mission go into one MCAP file.  The same seed gives the same messages, whatever the processes.
 """
 
 from __future__ import annotations
@@ -69,9 +69,11 @@ def main() -> None:
     """Render every frame and write the recording."""
     path = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).with_name("corridor.mcap")
     stamps_ns = frame_stamps_ns(START_NS, FRAME_RATE_HZ, round(APPROACH.duration_s * FRAME_RATE_HZ) + 1)
-    with RecordingWriter(path, MISSION) as recording, get_context("spawn").Pool(PROCESSES) as pool:
-        write(recording, calibration_message(CAMERA, frame_id="nav", t_capture_ns=START_NS), 0, START_NS)
-        pictures = track(pool.imap(jpeg, stamps_ns), description="Rendering", total=len(stamps_ns))
+    with get_context("spawn").Pool(PROCESSES) as pool:
+        pictures = list(track(pool.imap(jpeg, stamps_ns), description="Rendering", total=len(stamps_ns)))
+    with RecordingWriter(path, MISSION) as recording:
+        calibration = calibration_message(CAMERA, frame_id=MISSION.camera.name, t_capture_ns=START_NS)
+        write(recording, calibration, 0, START_NS)
         for sequence, (stamp_ns, picture) in enumerate(zip(stamps_ns, pictures, strict=True)):
             for message in frame_messages(stamp_ns, picture):
                 write(recording, message, sequence, stamp_ns)
