@@ -14,10 +14,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from astratag.annotate import annotate
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from numpy.typing import NDArray
 
+from astratag.annotate import annotate
 from astratag.camera import Camera
 from astratag.detection import Detection
 from astratag.detector import Detector
@@ -82,9 +82,9 @@ def detect_paths(
         except ValueError as error:
             skipped.append({"path": picture.name, "reason": str(error)})
             continue
-        entry, detections = _search(picture, image)
-        if annotate_dir is not None:
-            _write_annotated(Path(annotate_dir), picture.stem, image, detections)
+        entry, annotated = _search(picture, image, draw=annotate_dir is not None)
+        if annotate_dir is not None and annotated is not None:
+            _write_picture(Path(annotate_dir) / f"{picture.stem}.png", annotated)
         images.append(entry)
         if on_progress is not None:
             on_progress(entry)
@@ -94,8 +94,8 @@ def detect_paths(
     return {"images": images, "skipped": skipped}
 
 
-def _search(picture: Picture, image: Gray) -> tuple[dict[str, Any], list[Detection]]:
-    """Search a picture and return its entry, and the detections."""
+def _search(picture: Picture, image: Gray, *, draw: bool) -> tuple[dict[str, Any], Gray | None]:
+    """Search a picture and return its entry and, to ``draw``, the picture with what was found."""
     height, width = image.shape
     try:
         camera = picture.camera_of(width, height)
@@ -106,7 +106,8 @@ def _search(picture: Picture, image: Gray) -> tuple[dict[str, Any], list[Detecti
     seconds = time.perf_counter() - start_s
     found = [detection_record(detection) for detection in detections]
     entry = {"path": picture.name, "width": width, "height": height, "seconds": seconds, "detections": found}
-    return entry, detections
+    side_m = picture.detector.default.side_m
+    return entry, annotate(image, detections, camera, side_m=side_m) if draw else None
 
 
 def detection_record(detection: Detection) -> dict[str, Any]:
@@ -223,9 +224,7 @@ def _read_frame(envelope: Envelope) -> Gray:
     return decode_gray(decode(CompressedImage, envelope.payload).data)
 
 
-def _write_annotated(folder: Path, stem: str, image: Gray, detections: Sequence[Detection]) -> None:
-    """Write a picture with what was found drawn into it."""
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{stem}.png"
-    if not cv2.imwrite(str(path), annotate(image, detections)):
+def _write_picture(path: Path, image: Gray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not cv2.imwrite(str(path), image):
         raise ValueError(f"cannot write {path}")

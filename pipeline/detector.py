@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 
 import cv2
 import numpy as np
-from astratag.tracker import Tracker
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
@@ -15,15 +14,17 @@ from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from numpy.typing import NDArray
 
 import astratag.detection
+from astratag.annotate import LAYER_BGR
 from astratag.camera import Camera
 from astratag.detector import Detector, MarkerSpec
+from astratag.tracker import Tracker
 from pipeline.convert import camera_from_calibration, detection_message
 from pipeline.mission import Mission
 from pipeline.opencv_log import quiet_opencv
 from schemas import Detections
 from schemas.codec import AnyMessage
 
-LAYER_COLORS = ((0.20, 0.90, 0.35), (1.00, 0.70, 0.10), (0.95, 0.30, 0.85))
+LAYER_COLORS = tuple((red / 255, green / 255, blue / 255) for blue, green, red in LAYER_BGR)
 """Red, green and blue (0 to 1) of the outlines of the layers, outermost first."""
 GRID_COLOR = (0.30, 0.75, 1.00)
 TEXT_COLOR = (1.00, 1.00, 1.00)
@@ -32,7 +33,7 @@ FONT_PX = 16.0
 
 
 def decode_gray(data: bytes) -> NDArray[np.uint8]:
-    """Return the picture in a JPEG, PNG or other image file, uint8 gray (height, width).  Raises ValueError when it is damaged."""
+    """Return the picture in an image file's bytes, uint8 gray (height, width).  Raises ValueError when damaged."""
     with quiet_opencv():
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
     if image is None:
