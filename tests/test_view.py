@@ -21,11 +21,10 @@ from scipy.spatial.transform import Rotation
 from astratag.geometry import QUIET_MARGIN
 from astratag.surface import Cylinder, Flat
 from astratag.transforms import perturb, pose
-from pipeline import view
 from pipeline.corridor import in_corridor, port_to_port
 from pipeline.mission import CorridorSection, Mission, PoseSection
-from pipeline.view import Viewer
-from pipeline.view_geometry import (
+from pipeline.view import Viewer, layout, streams
+from pipeline.view.geometry import (
     PortMotion,
     body_mesh,
     corridor_strips,
@@ -35,6 +34,7 @@ from pipeline.view_geometry import (
     print_mesh,
     target_bodies,
 )
+from pipeline.view.viewer import OUT_OF_SIGHT_M
 from schemas import Envelope, Mode
 from schemas.topics import DETECTIONS, FRAME, STATE, TRUTH
 from tests.fake_run import MISSION, make_run
@@ -187,9 +187,16 @@ def test_a_run_is_in_the_file(tmp_path: Path):
     path = show(make_run(40, error=lambda k: ERROR), tmp_path / "new" / "run.rrd")
     found = entities(path)
     for name in ("range_m", "lateral_mm", "closing_mm_s"):
-        assert {f"/plots/{name}/{line}" for line in ("estimate", "truth", "bound")} <= found
-    overlay = {f"{view.OVERLAY}/{name}" for name in ("quads", "predicted", "grid", "axes", "labels")}
-    drawn = {view.IMAGE, *overlay, "scene/estimate/ellipsoid", "scene/target/marker_7", "scene/corridor", *view.PATHS}
+        assert {f"/plots/{name}/{line}" for line in ("estimate", "truth")} <= found
+    overlay = {f"{layout.OVERLAY}/{name}" for name in ("quads", "predicted", "grid", "axes", "labels")}
+    drawn = {
+        layout.IMAGE,
+        *overlay,
+        "scene/estimate/ellipsoid",
+        "scene/target/marker_7",
+        "scene/corridor",
+        *layout.PATHS,
+    }
     assert {f"/{name}" for name in drawn} | {"/events", "/legend", "/status/filter_mode"} <= found
     assert len(scalars(path, "/plots/range_m/estimate")) == 40
     assert scalars(path, "/plots/latency_ms") == {}  # nobody said when these frames entered the pipeline
@@ -217,8 +224,8 @@ def test_without_state_or_truth_nothing_of_them_is_drawn(tmp_path: Path):
     path = show(make_run(5, mode=lambda k: Mode.INIT, truth=False), tmp_path / "run.rrd")
     assert not scalars(path, "/plots/range_m/estimate") and not scalars(path, "/plots/range_m/truth")
     assert "/scene/truth/chaser" not in entities(path)
-    hidden = rows(path, f"/{view.CHASER}", "Transform3D:translation")
-    assert list(hidden) == [0] and hidden[0][0] == pytest.approx(view.OUT_OF_SIGHT_M)
+    hidden = rows(path, f"/{layout.CHASER}", "Transform3D:translation")
+    assert list(hidden) == [0] and hidden[0][0] == pytest.approx(OUT_OF_SIGHT_M)
 
 
 def test_the_overlay_goes_with_the_marker(tmp_path: Path):
@@ -232,8 +239,8 @@ def test_the_overlay_goes_with_the_marker(tmp_path: Path):
     run += [item for item in gone if item[0].topic is DETECTIONS and 3 <= item[0].stamp.sequence < 6]
     run.sort(key=lambda item: item[0].stamp.sequence)
     path = show(run, tmp_path / "run.rrd")
-    assert list(rows(path, f"/{view.OVERLAY}", "Clear:is_recursive")) == [3]
-    assert sorted(rows(path, f"/{view.OVERLAY}/quads", "LineStrips2D:strips")) == [0, 1, 2, 6, 7, 8]
+    assert list(rows(path, f"/{layout.OVERLAY}", "Clear:is_recursive")) == [3]
+    assert sorted(rows(path, f"/{layout.OVERLAY}/quads", "LineStrips2D:strips")) == [0, 1, 2, 6, 7, 8]
 
 
 def test_a_mission_without_a_map_shows_the_first_marker(tmp_path: Path):
@@ -297,7 +304,7 @@ def test_the_web_page_is_served():
 @pytest.mark.parametrize(
     ("display", "command", "reason"),
     [
-        (False, view.VIEWER_COMMAND, "no display"),
+        (False, streams.VIEWER_COMMAND, "no display"),
         (True, (sys.executable, "-c", "raise SystemExit(3)"), "code 3"),
         (True, ("/nowhere/rerun",), "cannot be started"),
     ],
@@ -306,8 +313,8 @@ def test_a_window_that_does_not_open_costs_one_warning(
     display: bool, command: tuple[str, ...], reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """The run is not held up meanwhile, and its file is whole."""
-    monkeypatch.setattr(view, "has_display", lambda: display)
-    monkeypatch.setattr(view, "VIEWER_COMMAND", command)
+    monkeypatch.setattr(streams, "has_display", lambda: display)
+    monkeypatch.setattr(streams, "VIEWER_COMMAND", command)
     warnings: list[str] = []
     path = tmp_path / "run.rrd"
     with Viewer(MISSION, rrd_path=path, mode="native", grpc_port=free_port(), warn=warnings.append) as viewer:
@@ -321,11 +328,11 @@ def test_writing_does_not_wait_for_the_window(monkeypatch: pytest.MonkeyPatch):
     """While the viewer is still starting, everything is taken: only close waits for it."""
     started = threading.Event()
 
-    def start_slowly(window: view._Window) -> str | None:
+    def start_slowly(window: streams.Window) -> str | None:
         started.wait()
         return "it is slow"
 
-    monkeypatch.setattr(view._Window, "_open", start_slowly)
+    monkeypatch.setattr(streams.Window, "_open", start_slowly)
     warnings: list[str] = []
     viewer = Viewer(MISSION, rrd_path=None, mode="native", grpc_port=free_port(), warn=warnings.append)
     for envelope, t_receipt_ns in make_run(5):
@@ -356,12 +363,12 @@ def test_no_view_reports_a_problem(tmp_path: Path):
     port = free_port()
     options = ["--headless", "--port", str(port), "--bind", "127.0.0.1", "--hide-welcome-screen"]
     with subprocess.Popen(
-        [*view.VIEWER_COMMAND, str(path), *options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [*streams.VIEWER_COMMAND, str(path), *options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     ) as process:
         try:
             client, deadline_s = None, time.monotonic() + 60
             while process.poll() is None and time.monotonic() < deadline_s:
-                if client is None and view._listening(port):
+                if client is None and streams.listening(port):
                     client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
                 if client is not None and client.get_state().views:
                     break

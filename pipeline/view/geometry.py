@@ -28,6 +28,10 @@ LIFT = 0.004
 """How far a print stands off its body, as a fraction of the print's side: hides no part of it."""
 
 
+SIGMAS = 3.0
+"""Bounds and ellipsoid are drawn at so many standard deviations."""
+ELLIPSOID_SCALE = 10.0
+"""The ellipsoid is drawn so many times as large: its millimetres would be lost in a scene of metres."""
 DASHES = 9
 """Dashes to a side of a predicted square, each ``DASH_SHARE`` of its place."""
 DASH_SHARE = 0.55
