@@ -36,6 +36,7 @@ MAGIC = b"\x89MCAP0\r\n"
 CHUNK_BYTES = 1 << 20
 MAX_SEQUENCE = 2**32 - 1
 MAX_NS = 2**63 - 1
+"""MCAP's sequence numbers have 32 bits; its times have 64, of which readers take 63."""
 FLUSH_PERIOD_S = 0.25
 """A kill loses what is not flushed and, at worst, the chunk being written: twice this."""
 _FOOTER = struct.Struct("<xQQQI8s")
@@ -360,7 +361,7 @@ def _count_if_whole(path: Path) -> int | None:
             found = sum(isinstance(record, Message) for record in records)
     except ValueError:
         return None
-    return found if found == recording.message_count > 0 else None
+    return found if found == recording.message_count else None
 
 
 def _copy_intact(file: IO[bytes], writer: Writer) -> tuple[int, int]:

@@ -88,6 +88,7 @@ def test_closing_twice_is_harmless(tmp_path: Path) -> None:
     writer.close()
     writer.close()
     assert Recording(tmp_path / "run.mcap").message_count == 0
+    assert recover(tmp_path / "run.mcap").whole
 
 
 def test_a_file_without_a_mission_has_the_default_one(tmp_path: Path) -> None:
