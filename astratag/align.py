@@ -13,17 +13,20 @@ from astratag.warp import BentWarp
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-STEPS_AT_BLUR = ((4, 0.03), (3, 0.0))
-"""Gauss-Newton steps, and the blur they are taken at as a fraction of the print's side in the image."""
+COARSE_BLUR, COARSE_STEPS = 0.03, 4
+"""Blur, as a fraction of the print's side in the image, at which a warp some cells off still finds its way."""
+FINE_STEPS = 3
+LEAST_BLUR_PX = 0.5
 TUKEY = 4.685
 _CROSS = np.array([(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])[:, None, :]
 
 
-def align(gray: Image, warp: BentWarp, points: Array, expected: Array) -> BentWarp:
+def align(gray: Image, warp: BentWarp, points: Array, expected: Array, *, blur: float, steps: int) -> BentWarp:
     """Return ``warp`` moved so that the image at its ``points`` (N, 2) looks like ``expected`` (N,).
 
     The light may vary: brightness is a quadratic surface over the print, contrast a linear one.  Gauss-Newton
-    with Tukey's weights, coarse to fine (Baker and Matthews, "Lucas-Kanade 20 years on", IJCV 2004).
+    ``steps`` with Tukey's weights on an image blurred by a fraction ``blur`` of the print's side
+    (Baker and Matthews, "Lucas-Kanade 20 years on", IJCV 2004).
     """
     u, v = (points / (TEMPLATE_UNITS / 2) - 1.0).T
     light = np.stack([u**0, u, v, u * v, u * u, v * v, expected, expected * u, expected * v], axis=1)
@@ -34,17 +37,16 @@ def align(gray: Image, warp: BentWarp, points: Array, expected: Array) -> BentWa
     part = gray[corner[1] : end[1], corner[0] : end[0]]
     if min(part.shape) < 8 or not np.isfinite(side_px):
         return warp
-    for steps, blur in STEPS_AT_BLUR:
-        smooth = cv2.GaussianBlur(part, (0, 0), blur * side_px) if blur * side_px > 0.5 else part
-        for _ in range(steps):
-            at = warp(points) - corner
-            inside = ((at >= 1) & (at <= np.array(smooth.shape[::-1]) - 2)).all(axis=1)
-            if inside.sum() < len(points) / 2:
-                return warp
-            value, right, left, below, above = sample(smooth, at[None, inside] + _CROSS)
-            slope = np.stack([(right - left) / 2, (below - above) / 2], axis=1)
-            by_warp = np.einsum("nk,nkp->np", slope, warp.jacobian(points[inside]))
-            warp = warp.stepped(_solve(np.column_stack([-by_warp, light[inside]]), value, warp.step_sigma()))
+    smooth = cv2.GaussianBlur(part, (0, 0), blur * side_px) if blur * side_px > LEAST_BLUR_PX else part
+    for _ in range(steps):
+        at = warp(points) - corner
+        inside = ((at >= 1) & (at <= np.array(smooth.shape[::-1]) - 2)).all(axis=1)
+        if inside.sum() < len(points) / 2:
+            return warp
+        value, right, left, below, above = sample(smooth, at[None, inside] + _CROSS)
+        slope = np.stack([(right - left) / 2, (below - above) / 2], axis=1)
+        by_warp = (slope[:, None, :] @ warp.jacobian(points[inside]))[:, 0]
+        warp = warp.stepped(_solve(np.column_stack([-by_warp, light[inside]]), value, warp.step_sigma()))
     return warp
 
 

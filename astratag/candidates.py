@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.align import align
+from astratag.align import COARSE_BLUR, COARSE_STEPS, FINE_STEPS, align
 from astratag.geometry import TEMPLATE_UNITS, square
 from astratag.signature import ACCEPT_OF_MANY_WARPS, SAMPLES, Artwork, Codebook, Reading, Warp, cell_values
 from astratag.tps import KNOTS, ThinPlate, ThinPlateWarp, bent_places
@@ -22,6 +22,10 @@ PROMISING = 0.5
 MAX_CANDIDATES = 12
 FAINT = 0.25
 """Correlation as if flat from which a quad is worth bending."""
+HOPELESS = 0.4
+"""Correlation after a coarse alignment below which a fine one is not tried."""
+SURE = 0.85
+"""Correlation from which a reading needs no second opinion."""
 MAX_BENT = 3
 LEAST_BENT_SIDE_PX = 24.0
 OUTER = square(0.0, TEMPLATE_UNITS)
@@ -84,13 +88,18 @@ def _bend(gray: Image, candidate: Candidate, codebook: Codebook, artwork: Artwor
     best: Candidate | None = None
     for start in (candidate, _through_splines(gray, candidate, codebook)):
         marker_id = start.reading.marker_id
+        expected = artwork.expected(marker_id)[0]
         warp = BentWarp.from_points(KNOTS, start.warp(KNOTS))
-        warp = align(gray, warp, artwork.points, artwork.expected(marker_id)[0])
-        reading = codebook.read_as(cell_values(gray, warp(SAMPLES)[None])[0], marker_id)
-        if reading.correlation >= ACCEPT_OF_MANY_WARPS and (
-            best is None or reading.correlation > best.reading.correlation
-        ):
-            best = Candidate(reading, warp(OUTER), warp, bent=True)
+        for blur, steps, least in ((COARSE_BLUR, COARSE_STEPS, HOPELESS), (0.0, FINE_STEPS, ACCEPT_OF_MANY_WARPS)):
+            warp = align(gray, warp, artwork.points, expected, blur=blur, steps=steps)
+            reading = codebook.read_as(cell_values(gray, warp(SAMPLES)[None])[0], marker_id)
+            if reading.correlation < least:
+                break
+        else:
+            if best is None or reading.correlation > best.reading.correlation:
+                best = Candidate(reading, warp(OUTER), warp, bent=True)
+        if best is not None and best.reading.correlation > SURE:
+            break
     return best
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astratag.camera import Camera
-from astratag.candidates import OUTER, PROMISING, Candidate, bent_candidates, flat_candidates
+from astratag.candidates import OUTER, PROMISING, SURE, Candidate, bent_candidates, flat_candidates
 from astratag.detection import Detection, LayerDetection, PlanarPose
 from astratag.dictionary import Dictionary, load_dictionary
 from astratag.edges import Transfer, inverse_transfer
@@ -34,8 +34,6 @@ Array = NDArray[np.float64]
 
 HALVE_FROM_PX = 500_000
 """Images with more pixels than this are searched at half resolution first."""
-SURE = 0.85
-"""Correlation from which a reading needs no second opinion."""
 LEAST_LIKENESS = 0.45
 """Correlation of the whole print with what is seen through a fit, below which it is something else."""
 CERTAIN_LIKENESS = 0.85

@@ -141,7 +141,7 @@ class Artwork:
     GRID = 32
     REACH = 0.12
     """How far beyond the square to look, as a fraction of its side: less than the quiet margin."""
-    UNITS_PER_PIXEL = 0.5
+    UNITS_PER_PIXEL = 1.0
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
@@ -164,7 +164,7 @@ class Artwork:
         return self._expected[marker_id]
 
     def _picture(self, code: NDArray[np.uint8]) -> Image:
-        """Return the print with its margin, half a unit to the pixel."""
+        """Return the print with its margin, a unit to the pixel."""
         margin = QUIET_MARGIN * TEMPLATE_UNITS
         size = round((TEMPLATE_UNITS + 2 * margin) / self.UNITS_PER_PIXEL)
         picture = np.full((size, size), 255, np.uint8)
