@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,12 +58,9 @@ class Columns:
     latency_s: Array
 
 
-def write_report(run_path: str | Path, summary: Summary, out_png: str | Path, *, parts: Sequence[Path] = ()) -> None:
-    """Draw the run recorded in ``run_path``, and in further ``parts`` when the recorder was started again.
-
-    Raises RecordingError (a ValueError) when one cannot be read.
-    """
-    draw_report(load_run(run_path, *parts), summary).savefig(out_png)
+def write_report(run_path: str | Path, summary: Summary, out_png: str | Path) -> None:
+    """Draw the run recorded in ``run_path``.  Raises RecordingError (a ValueError) when it cannot be read."""
+    draw_report(load_run(run_path), summary).savefig(out_png)
 
 
 def draw_report(run: Run, summary: Summary) -> Figure:
@@ -294,7 +291,16 @@ def _draw_latency(ax: Axes, run: Run, c: Columns) -> None:
     ax.hist(np.minimum(latency_ms, top), LATENCY_BINS, range=(0, top), color=ESTIMATE, alpha=0.75)
     for value, name, height in ((p50, "p50", 0.98), (p99, "p99", 0.86)):
         ax.axvline(value, color=INK, linewidth=1, linestyle=(0, (4, 3)))
-        ax.annotate(f" {name} {value:.1f} ms", (value, height), xycoords=("data", "axes fraction"), va="top", color=INK)
+        ax.annotate(
+            f"{name} {value:.1f} ms",
+            (value, height),
+            xytext=(4, 0),
+            xycoords=("data", "axes fraction"),
+            textcoords="offset points",
+            va="top",
+            color=INK,
+            bbox={"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 2},
+        )
     ax.set_xlim(0, top)
     ax.set_xlabel("ms" + (", later ones in the last bar" if latency_ms.max() > top else ""), color=MUTED)
     ax.set_ylabel("frames", color=MUTED)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -152,13 +151,10 @@ class _Parts:
             self.calibration = message
 
 
-def load_run(*paths: str | Path) -> Run:
-    """Read a recorded run, from all its parts when the recorder was started again.
-
-    Raises RecordingError (a ValueError) when one is not a readable recording.
-    """
-    recordings = [Recording(path) for path in paths]
-    return gather_run(recordings[0].mission, chain.from_iterable(recording.envelopes() for recording in recordings))
+def load_run(path: str | Path) -> Run:
+    """Read a recorded run.  Raises RecordingError (a ValueError) when it is not a readable recording."""
+    recording = Recording(path)
+    return gather_run(recording.mission, recording.envelopes())
 
 
 def gather_run(mission: Mission, received: Iterable[tuple[Envelope, int]]) -> Run:

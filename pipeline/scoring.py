@@ -122,12 +122,9 @@ class Summary(Section):
     events: list[LoggedEvent]
 
 
-def score(path: str | Path, *more: str | Path) -> Summary:
-    """Score a recorded run, from all its parts when the recorder was started again.
-
-    Raises ValueError when one is not a readable recording, or when they hold nothing to score.
-    """
-    run = load_run(path, *more)
+def score(path: str | Path) -> Summary:
+    """Score a recorded run.  Raises ValueError when it is not a readable recording, or holds nothing to score."""
+    run = load_run(path)
     if all(row.state is None and row.detections is None for row in run.rows):
         raise ValueError(f"{path} holds no detections and no states: replay it first, then score the run it writes")
     return score_run(run)

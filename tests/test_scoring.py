@@ -165,20 +165,6 @@ def test_files_of_a_run(tmp_path: Path):
     assert written["detections_by_layer"].keys() == {"0", "1", "2"}
 
 
-def test_parts_of_a_run_score_as_one(tmp_path: Path):
-    """A recorder that was started again wrote two files; with a gap between them it lost frames."""
-    with (
-        RecordingWriter(tmp_path / "a.mcap", MISSION) as first,
-        RecordingWriter(tmp_path / "b.mcap", MISSION) as second,
-    ):
-        for envelope, t_ns in make_run(frames=40):
-            if envelope.stamp.sequence not in (20, 21):
-                (first if envelope.stamp.sequence < 20 else second).write(envelope, t_ns)
-    summary = score(tmp_path / "a.mcap", tmp_path / "b.mcap")
-    assert (summary.frames, summary.states_scored, summary.dropped) == (38, 38, 2)
-    assert summary.range_m.last == pytest.approx(0.06, abs=1e-3)
-
-
 def test_a_recording_with_nothing_to_score_is_refused(tmp_path: Path):
     with RecordingWriter(tmp_path / "raw.mcap", MISSION) as writer:
         for envelope, t_ns in make_run(frames=3):
