@@ -55,12 +55,12 @@ PLOTS = (
 WITH_LEGEND = ("range_m", "seen", "position_error_mm", "nis")
 
 LEGEND = f"""\
-A **chaser** flies down a corridor to a **target** and measures where it is from the printed markers.
+A **chaser** comes in to a **target** and measures where it is from the printed markers.
 
-- **blue** estimated, **green** true (when recorded)
-- **grey** {SIGMAS:.0f}-sigma and 95 % bounds; **ellipsoid** {SIGMAS:.0f} sigma, drawn {ELLIPSOID_SCALE:.0f} times as large
-- **violet** approach corridor
-- layers: **yellow** outer, **orange** middle, **red** inner; *dashed* predicted, *white grid* curved print
+- **blue** estimated, **green** true, **grey** {SIGMAS:.0f}-sigma and 95 % bounds
+- **ellipsoid** {SIGMAS:.0f} sigma, {ELLIPSOID_SCALE:.0f} times enlarged; **violet** corridor
+- layers **yellow** outer, **orange** middle, **red** inner
+- *dashed* predicted, *white grid* curved print
 """
 
 
@@ -128,13 +128,13 @@ def blueprint(corridor: CorridorSection) -> rrb.Blueprint:
         rrb.TextDocumentView(origin="legend", name="What you see"),
         rrb.StateTimelineView(origin=STATUS, name="Status"),
         rrb.TextLogView(origin="events", name="Events", columns=rrb.TextLogColumns(text_log_columns=["Body"])),
-        row_shares=[0.4, 0.34, 0.26],
+        row_shares=[0.36, 0.38, 0.26],
     )
     above = rrb.Horizontal(
         rrb.Spatial2DView(origin=CAMERA, name="Camera", background=[0, 0, 0]),
         rrb.Tabs(wide, near),
         status,
-        column_shares=[0.41, 0.32, 0.27],
+        column_shares=[0.42, 0.31, 0.27],
     )
     plots = [
         rrb.TimeSeriesView(
@@ -143,7 +143,7 @@ def blueprint(corridor: CorridorSection) -> rrb.Blueprint:
         for name, title in PLOTS
     ]
     return rrb.Blueprint(
-        rrb.Vertical(above, rrb.Grid(*plots, grid_columns=4), row_shares=[0.51, 0.49]),
+        rrb.Vertical(above, rrb.Grid(*plots, grid_columns=4), row_shares=[0.5, 0.5]),
         rrb.TimePanel(state="collapsed", timeline="capture_time"),
         collapse_panels=True,
     )
