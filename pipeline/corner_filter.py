@@ -123,7 +123,7 @@ class CornerFilter:
         for k, layer in enumerate(layers):
             rows = slice(CORNER_DOF * k, CORNER_DOF * (k + 1))
             residual, H = layer.corners_px.ravel() - seen[0][rows], seen[1][rows]
-            S = H @ self.covariance @ H.T + layer.sigma_px**2 * np.eye(CORNER_DOF)
+            S = H @ self.covariance @ H.T + self._corner_noise([layer])
             distances[k] = residual @ np.linalg.solve(S, residual)
         return distances
 
@@ -134,7 +134,7 @@ class CornerFilter:
         """
         prior, P_prior = self.motion, self.covariance
         observed = np.concatenate([layer.corners_px.ravel() for layer in layers])
-        R = np.diag(np.repeat([layer.sigma_px**2 for layer in layers], CORNER_DOF))
+        R = self._corner_noise(layers)
         no_prediction = np.zeros(len(observed))
         kalman, error = self._kalman, np.zeros(STATES)
         for _ in range(MOST_ITERATIONS):
@@ -155,6 +155,13 @@ class CornerFilter:
         kalman.P = P_prior
         return None
 
+    def _corner_noise(self, layers: Sequence[SeenLayer]) -> Array:
+        """Return the covariance (8 L, 8 L) of corners: each one's own, and the shift of the picture that all share."""
+        R = np.diag(np.repeat([layer.sigma_px**2 for layer in layers], CORNER_DOF))
+        R[::2, ::2] += self.noise.picture_shift_px**2
+        R[1::2, 1::2] += self.noise.picture_shift_px**2
+        return R
+
     def _accept(self, motion: Motion, error: Array) -> Update:
         """Put the error into the motion and express the covariance in the axes of the new attitude."""
         kalman = self._kalman
@@ -170,6 +177,12 @@ class CornerFilter:
         apart = self.motion.error_of(other.motion)
         own, others = self.covariance, other.covariance
         self._kalman.P = (1 - probability) * own + probability * (others + np.outer(apart, apart))
+
+    def distrust_pose(self, factor: float) -> None:
+        """Multiply the standard deviations of position and attitude."""
+        scale = np.ones(STATES)
+        scale[POSITION] = scale[ATTITUDE] = factor
+        self._kalman.P = scale[:, None] * self.covariance * scale
 
     def misfit(self, layers: Sequence[SeenLayer], eye: Eye) -> float:
         """Return the squared residuals of layers at the motion as it is now, in units of their variance."""

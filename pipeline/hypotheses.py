@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 POSE_DOF = 6
 START_MISFIT = 25.0
 """A first pose whose squared residuals are this many times what their noise explains is not believed."""
+FIRST_LOOK = 4.0
+"""How many times less certain a pose is begun with than its corners promise: a search is cruder than tracking."""
 ONE_MODE = 2.0
 """Squared distance, in units of the summed covariances, below which two equal Gaussians have a single mode: each is
 then within two of its own standard deviations of the other."""
@@ -51,6 +53,8 @@ class HypothesisBank:
         best_misfit, best = found[0]
         scale = max(1.0, best_misfit / dof)
         rival = next((pair for pair in found[1:] if not is_one_mode(best, pair[1])), None)
+        for candidate in (best,) if rival is None else (best, rival[1]):
+            candidate.distrust_pose(FIRST_LOOK)
         if rival is None:
             return cls([best], [0.0], noise)
         return cls([best, rival[1]], [-best_misfit / scale / 2, -rival[0] / scale / 2], noise)

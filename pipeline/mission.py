@@ -105,6 +105,10 @@ class FilterSection(Section):
     edge_bias_px: float = Field(default=0.03, ge=0)
     """How far the edges of every black square may be measured outside or inside their place, all by the same."""
     edge_bias_correlation_s: float = Field(default=5.0, gt=0)
+    corner_floor_px: float = Field(default=0.03, gt=0)
+    """No corner is believed better than this."""
+    picture_shift_px: float = Field(default=0.05, ge=0)
+    """How far a whole picture may be shifted: vibration, a late stamp, what compression does to parallel edges."""
     initial_speed_m_s: float = Field(default=0.2, gt=0)
     initial_rate_rad_s: float = Field(default=0.2, gt=0)
     gate_probability: float = Field(default=0.999, gt=0.5, lt=1)

@@ -30,8 +30,6 @@ Array = NDArray[np.float64]
 
 CHASER_FRAME, TARGET_FRAME = "chaser", "target"
 NODE = "pose_filter"
-SIGMA_FLOOR_PX = 0.01
-"""No corner is believed better than this."""
 FARTHEST_PX = 1e5
 """A corner farther from the image's origin, or less certain, than this is damaged."""
 FARTHEST_M = 1e5
@@ -159,7 +157,7 @@ class PoseFilter:
                 if np.abs(corners_px).max() > FARTHEST_PX or seen.sigma_px > FARTHEST_PX:
                     frame.rejections.append(f"corners: marker {marker.id} layer {seen.layer} is out of bounds")
                     continue
-                sigma_px = max(seen.sigma_px, SIGMA_FLOOR_PX)
+                sigma_px = max(seen.sigma_px, self._settings.corner_floor_px)
                 points = corners_on_target(marker, seen.layer)
                 layers.append(SeenLayer(marker.id, seen.layer, corners_px, sigma_px, points))
             if layers:

