@@ -89,9 +89,16 @@ def detect_paths(
         if on_progress is not None:
             on_progress(entry)
     if not images:
-        broken = f": {len(skipped)} broken, the first {skipped[0]['path']}" if skipped else ""
-        raise ValueError(f"no image could be read in {', '.join(map(str, paths)) or 'no path at all'}{broken}")
+        raise ValueError(f"no image could be read in {', '.join(map(str, paths)) or 'no path at all'}{_why(skipped)}")
     return {"images": images, "skipped": skipped}
+
+
+def _why(skipped: Sequence[dict[str, str]]) -> str:
+    """Return the first reason for skipping, to go on with after what was skipped."""
+    if not skipped:
+        return ""
+    more = f", and {len(skipped) - 1} more" if len(skipped) > 1 else ""
+    return f": {skipped[0]['path']}: {skipped[0]['reason']}{more}"
 
 
 def _search(picture: Picture, image: Gray, *, draw: bool) -> tuple[dict[str, Any], Gray | None]:

@@ -112,7 +112,8 @@ def test_a_broken_image_is_skipped_and_counted(folder: Path):
 
 def test_nothing_readable_is_an_error(tmp_path: Path):
     (tmp_path / "a.png").write_bytes(b"broken")
-    with pytest.raises(ValueError, match=r"no image could be read in .*: 1 broken"):
+    (tmp_path / "b.jpg").write_bytes(b"broken too")
+    with pytest.raises(ValueError, match=r"no image could be read in .*a\.png: 6 bytes are not a whole image.*1 more$"):
         detect_paths([tmp_path])
     with pytest.raises(ValueError, match="no image could be read in no path at all"):
         detect_paths([])
