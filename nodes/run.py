@@ -15,6 +15,7 @@ from typing import Literal
 
 from rich.console import Console
 
+from astratag.dictionary import load_dictionary
 from nodes.bus import Link, free_endpoint
 from nodes.cli import EXIT_INTERRUPTED
 from nodes.processes import PROCESSES
@@ -119,7 +120,10 @@ def _shipped_recording() -> str:
 
 
 def _open(args: argparse.Namespace, spec: str) -> Source:
-    return open_source(spec, camera=args.camera, mission=args.mission, fps=args.fps, scale_camera=args.scale_camera)
+    """Open the source and check what the nodes will need, so that what is wrong is said before they start."""
+    source = open_source(spec, camera=args.camera, mission=args.mission, fps=args.fps, scale_camera=args.scale_camera)
+    load_dictionary(source.mission.dictionary)
+    return source
 
 
 def _subject(source: Source, spec: str) -> Subject:

@@ -137,8 +137,11 @@ class Shell:
         match event:
             case Received():
                 self._take(event)
-            case Presence(node=node, alive=alive):
-                (self._present.add if alive else self._present.discard)(node)
+            case Presence(node=node, alive=True):
+                self._present.add(node)
+                self._ended.pop(node, None)  # it was started again
+            case Presence(node=node, alive=False):
+                self._present.discard(node)
             case Credit(node=node, ended=True):
                 self._ended[node] = event
                 self._awaited.discard(node)  # it died before it came up
@@ -225,7 +228,7 @@ class Shell:
             raise NodeError(f"frames came, but no {missing} within {LATCH_PATIENCE_S:.0f} s")
         if self._done:
             return
-        if now_s >= self._idle_due_s:
+        if now_s >= self._idle_due_s and not self._ended:
             self._idle_due_s = now_s + IDLE_PERIOD_S
             self._publish(self._work.idle(time.time_ns()))
         if self._options.lossless and self._producers <= self._ended.keys():
