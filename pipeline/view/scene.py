@@ -53,12 +53,12 @@ def draw_corridor(log: Log, corridor: CorridorSection) -> None:
     log(f"{SCENE}/corridor/edges", edges, static=True)
 
 
-def draw_vehicle(log: Log, path: str, T_chaser_port: Array, *, color: int, width: float) -> None:
+def draw_vehicle(log: Log, path: str, T_chaser_port: Array, *, color: int, width: float, size: float = 1.0) -> None:
     """Draw a chaser's hull in its own frame and style its path, in lines of ``width`` points of the screen."""
-    half_m = np.array(CHASER_M) / 2
+    half_m = size * np.array(CHASER_M) / 2
     radius = rr.Radius.ui_points(width)
     hull = rr.Boxes3D(
-        centers=[(0.0, 0.0, -half_m[2])],
+        centers=[(0.0, 0.0, -CHASER_M[2] / 2)],
         half_sizes=[half_m],
         colors=color,
         radii=radius,

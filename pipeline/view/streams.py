@@ -119,10 +119,7 @@ class Window(Live):
     def close(self) -> None:
         """Wait for a window that is still opening, send it what is left and leave it open."""
         self._starter.join(START_TIMEOUT_S)
-        try:
-            super().close()
-        except RuntimeError:
-            self._warn("Rerun's window was closed before the end of the run")
+        super().close()
 
     def _start(self) -> None:
         stream = self.stream

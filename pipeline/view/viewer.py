@@ -37,6 +37,8 @@ KEPT_FRAMES = 256
 NIS_BAND = (0.025, 0.975)
 OUT_OF_SIGHT_M = (0.0, 1e3, 1e3)
 """Where a chaser without a state waits: behind every eye that looks at the target."""
+TRUTH_SIZE = 1.15
+"""The true chaser is drawn so much larger than the estimated one, to be seen around it."""
 FRUSTUM_SHARE, FRUSTUM_M = 0.4, (0.02, 0.3)
 """How far before the camera its picture hangs: a share of the range, within limits in metres."""
 
@@ -72,6 +74,7 @@ class Viewer:
         warn: Warn | None = None,
     ):
         self._mission = mission
+        self._warn = warn or logging.getLogger(__name__).warning
         self._T_chaser_port = mission.T_chaser_port.matrix()
         self._T_target_port = mission.T_target_port.matrix()
         self._last: dict[str, Any] = {}
@@ -84,7 +87,7 @@ class Viewer:
         if mode == "web":
             self._live = serve_web(host, web_port, grpc_port)
         elif mode == "native":
-            self._live = Window(grpc_port, warn or logging.getLogger(__name__).warning)
+            self._live = Window(grpc_port, self._warn)
         self.url = self._live.url if self._live is not None else None
         """Where the live view is, None when there is none."""
         self._handlers: dict[str, Callable[[Any, Envelope, int], None]] = {
@@ -113,9 +116,12 @@ class Viewer:
 
     def close(self) -> None:
         """Finish the file and send the rest to the window, which stays; a served page ends here."""
-        if self._live is not None:
-            self._live.close()
-            self._live = None
+        live, self._live = self._live, None
+        if live is not None:
+            try:
+                live.close()
+            except RuntimeError:
+                self._warn("Rerun's window was closed before the end of the run")
         if self._file is not None:
             self._file.disconnect()
             self._file = None
@@ -152,7 +158,7 @@ class Viewer:
         draw_corridor(self._log, self._mission.corridor)
         markers = [(m.id, m.T_target_marker.matrix(), m.side_m, m.surface.surface()) for m in self._mission.markers]
         draw_target(self._log, markers, load_dictionary(self._mission.dictionary))
-        draw_vehicle(self._log, layout.ESTIMATE, self._T_chaser_port, color=layout.ESTIMATE_COLOR, width=1.5)
+        draw_vehicle(self._log, layout.ESTIMATE, self._T_chaser_port, color=layout.ESTIMATE_COLOR, width=1.2)
         cloud = rr.Ellipsoids3D.from_fields(
             colors=[layout.ESTIMATE_COLOR],
             fill_mode=rr.components.FillMode.TransparentFillMajorWireframe,
@@ -233,7 +239,9 @@ class Viewer:
 
     def _draw_truth(self, truth: Truth, envelope: Envelope, _t_ns: int) -> None:
         if layout.TRUTH not in self._path_ends:
-            draw_vehicle(self._log, layout.TRUTH, self._T_chaser_port, color=layout.TRUTH_COLOR, width=0.8)
+            draw_vehicle(
+                self._log, layout.TRUTH, self._T_chaser_port, color=layout.TRUTH_COLOR, width=0.8, size=TRUTH_SIZE
+            )
         T_chaser_target = pose_matrix(truth.T_chaser_target)
         motion = self._motion(truth, T_chaser_target)
         self._draw_chaser(layout.TRUTH, T_chaser_target, motion)
