@@ -1,0 +1,80 @@
+"""How often chance reads as a marker, and the thresholds that keep it from doing so.
+
+A *candidate* is something square in an image, not a marker.  It is compared with every reading of the
+dictionary (``templates``: four times its ids) through every warp tried (``warps``), and the best counts.  Its
+cells are modelled as independent, identically distributed normal values (soft), or fair coin tosses (hard).
+The chances of the comparisons are added up (union bound), which is at most a little too careful.
+
+Real textures are smooth, so that neighbouring cells go together and 48 of them are worth fewer independent
+ones: pass what ``effective_cells`` measured on them as ``cells``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import betainc, betaincinv
+from scipy.stats import binom
+
+from astratag.geometry import CELLS
+
+FALSE_ACCEPT_RATE = 1e-6
+"""The share of candidates that may be accepted by chance, unless told otherwise."""
+
+
+def chance_of_correlation(threshold: float, cells: float = CELLS) -> float:
+    """Return the chance that ``cells`` independent normal values correlate with a given code above a threshold.
+
+    With the mean removed the values point anywhere in ``cells - 1`` dimensions alike, so that
+    r^2 ~ Beta(1/2, cells/2 - 1), which is Student's t = r sqrt((cells - 2) / (1 - r^2)) with cells - 2 degrees
+    of freedom: R. A. Fisher, "Frequency distribution of the values of the correlation coefficient", 1915.
+    """
+    tail = betainc(cells / 2 - 1, 0.5, 1.0 - threshold**2) / 2
+    return float(tail if threshold >= 0 else 1.0 - tail)
+
+
+def acceptance_threshold(
+    templates: int, warps: int = 1, false_accept_rate: float = FALSE_ACCEPT_RATE, cells: float = CELLS
+) -> float:
+    """Return the correlation that the best of ``templates`` x ``warps`` comparisons with chance rarely exceeds.
+
+    Of chance candidates a share of at most ``false_accept_rate`` does, in (0, 1).  1.0 for too few ``cells`` to say.
+    Raises ValueError for counts below one or a rate outside (0, 1).
+    """
+    _check(templates, warps)
+    if not 0 < false_accept_rate < 1:
+        raise ValueError(f"false_accept_rate is a share of candidates in (0, 1), got {false_accept_rate}")
+    if cells <= 2:
+        return 1.0
+    chance = min(false_accept_rate / (templates * warps), 0.5)
+    return float(np.sqrt(1.0 - betaincinv(cells / 2 - 1, 0.5, 2 * chance)))
+
+
+def effective_cells(correlations: ArrayLike) -> float:
+    """Return how many independent cells would scatter as these correlations of non-markers with codes do.
+
+    ``correlations``: of any shape, every one of them and not only each candidate's best.  The variance of the
+    correlation of n independent cells is 1 / (n - 1).
+    """
+    return 1.0 + 1.0 / float(np.mean(np.square(correlations)))
+
+
+def hamming_false_accept_rate(tau: int, templates: int, warps: int = 1, cells: int = CELLS) -> float:
+    """Return the share of chance candidates within ``tau`` wrong cells of some reading.
+
+    The paper's thresholds of 3, 5 and 10 with its dictionary of twenty (80 readings): 5e-9, 5e-7 and 2.5e-3.
+    ``acceptance_threshold`` with this rate is the correlation threshold that is as strict.
+    """
+    _check(templates, warps)
+    return float(min(templates * warps * binom.cdf(tau, cells, 0.5), 1.0))
+
+
+def hamming_threshold(templates: int, warps: int = 1, false_accept_rate: float = FALSE_ACCEPT_RATE) -> int | None:
+    """Return the most wrong cells that may be forgiven at a false-accept rate; None when not even a perfect reading."""
+    allowed = [t for t in range(CELLS) if hamming_false_accept_rate(t, templates, warps) <= false_accept_rate]
+    return max(allowed, default=None)
+
+
+def _check(templates: int, warps: int) -> None:
+    if templates < 1 or warps < 1:
+        raise ValueError(f"templates and warps are counts of at least one, got {templates} and {warps}")
