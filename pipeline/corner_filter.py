@@ -105,10 +105,10 @@ class CornerFilter:
         """Return a filter of its own in the same state."""
         return CornerFilter(self.motion, self.covariance.copy(), self.noise)
 
-    def predict(self, dt_s: float) -> None:
-        """Let ``dt_s`` seconds pass."""
+    def predict(self, dt_s: float, unseen_s: float = 0.0) -> None:
+        """Let ``dt_s`` seconds pass, at the end of which nothing was measured for ``unseen_s`` seconds."""
         self._kalman.F = self.motion.transition(dt_s, self.noise)
-        self._kalman.Q = process_noise(dt_s, self.noise)
+        self._kalman.Q = process_noise(dt_s, self.noise, unseen_s)
         self._kalman.predict()
         self.motion = self.motion.after(dt_s, self.noise)
 

@@ -87,14 +87,18 @@ class Motion:
         return F
 
 
-def process_noise(dt_s: float, noise: FilterSection) -> Array:
-    """Return the covariance (13, 13) that ``dt_s`` seconds of white accelerations and of edge bias drift add."""
+def process_noise(dt_s: float, noise: FilterSection, unseen_s: float = 0.0) -> Array:
+    """Return the covariance (13, 13) that ``dt_s`` seconds of white accelerations and of edge bias drift add.
+
+    Measured often, accelerations are white over ``correlation_s``.  An acceleration that has not been seen for longer,
+    ``unseen_s`` seconds, has acted all the while: speeds then grow uncertain with time, not with its square root.
+    """
     Q = np.zeros((STATES, STATES))
     for place, speed, sigma in (
         (POSITION, VELOCITY, noise.acceleration_m_s2),
         (ATTITUDE, RATE, noise.angular_acceleration_rad_s2),
     ):
-        density = sigma**2 * noise.correlation_s
+        density = sigma**2 * max(noise.correlation_s, unseen_s)
         Q[place, place] = density * dt_s**3 / 3 * np.eye(3)
         Q[place, speed] = Q[speed, place] = density * dt_s**2 / 2 * np.eye(3)
         Q[speed, speed] = density * dt_s * np.eye(3)

@@ -79,10 +79,10 @@ class HypothesisBank:
         """Return a bank of its own in the same state."""
         return HypothesisBank([f.copy() for f in self.filters], list(self._log_weights), self._noise)
 
-    def predict(self, dt_s: float) -> None:
-        """Let ``dt_s`` seconds pass."""
+    def predict(self, dt_s: float, unseen_s: float = 0.0) -> None:
+        """Let ``dt_s`` seconds pass, at the end of which nothing was measured for ``unseen_s`` seconds."""
         for hypothesis in self.filters:
-            hypothesis.predict(dt_s)
+            hypothesis.predict(dt_s, unseen_s)
 
     def gate(self, layers: Sequence[SeenLayer], eye: Eye) -> Array:
         """Return the normalised innovation squared of each layer under the pose that it fits best."""

@@ -98,9 +98,9 @@ class CorridorSection(Section):
 class FilterSection(Section):
     """The pose filter's noise, gates and timers."""
 
-    acceleration_m_s2: float = Field(default=0.008, gt=0)
-    """Standard deviation of the relative acceleration, white over ``correlation_s``."""
-    angular_acceleration_rad_s2: float = Field(default=0.025, gt=0)
+    acceleration_m_s2: float = Field(default=0.005, gt=0)
+    """Standard deviation of the relative acceleration, white over ``correlation_s``: slow approaches without burns."""
+    angular_acceleration_rad_s2: float = Field(default=0.015, gt=0)
     correlation_s: float = Field(default=0.2, gt=0)
     edge_bias_px: float = Field(default=0.03, ge=0)
     """How far the edges of every black square may be measured outside or inside their place, all by the same."""

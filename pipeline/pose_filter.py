@@ -94,7 +94,7 @@ class PoseFilter:
         coasted = self._bank
         if coasted is not None:
             coasted = coasted.copy()
-            coasted.predict((t_ns - self._t_ns) / NS_PER_S)
+            coasted.predict((t_ns - self._t_ns) / NS_PER_S, self._age_s(t_ns) or 0.0)
             self._settle_mode(frame)
         return self._answer(frame, coasted)
 
@@ -129,7 +129,7 @@ class PoseFilter:
         elif self._bank is not None and self._t_ns is not None:
             self._lose_when_old(frame)
             if self._bank is not None:
-                self._bank.predict((frame.t_ns - self._t_ns) / NS_PER_S)
+                self._bank.predict((frame.t_ns - self._t_ns) / NS_PER_S, self._age_s(frame.t_ns) or 0.0)
         self._t_ns = frame.t_ns
         return True
 
