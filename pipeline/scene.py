@@ -122,29 +122,36 @@ class Scene:
         for index, sight in self._trace(camera, T_cam_scene, np.zeros(2)):
             np.copyto(winner[sight.window], index, where=sight.won)
             np.copyto(depth[sight.window], sight.hit.depth, where=sight.won)
-        sun_scene = T_cam_scene[:3, :3].T @ self.sun.direction_cam
         light, rays = np.ones_like(depth), pixel_rays(camera)[0]
         for index in np.unique(winner[winner >= 0]).tolist():
-            body = self.bodies[index]
-            casters = [c for c in self.bodies if c.casts_shadow and c is not body and _may_shade(c, body, sun_scene)]
             where = np.nonzero(winner == index)
             far = depth[where]
             point = (rays[(*where, 0)].astype(np.float32) * far, rays[(*where, 1)].astype(np.float32) * far, far)
-            free = np.ones(far.shape, bool)
-            for caster in casters:
-                T_caster_cam = inverse(T_cam_scene @ caster.T_scene_body)
-                turned = _turn(T_caster_cam[:3, :3], point)
-                start = tuple(p + float(t) for p, t in zip(turned, T_caster_cam[:3, 3], strict=True))
-                with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-                    met = caster.shape.hit(start, _floats(T_caster_cam[:3, :3] @ self.sun.direction_cam))
-                free &= ~(met.seen & (met.depth > SHADOW_GAP_M))
-            light[where] = free
+            light[where] = self._in_the_open(self.bodies[index], T_cam_scene, point)
         # A body that covers only part of a pixel borrows the light of its neighbour; inside it, shadows end softly.
         around = np.ones((3, 3), np.uint8)
         np.copyto(light, cv2.erode(light, around), where=winner < 0)
         alone = cv2.erode(winner, around) == cv2.dilate(winner, around)
         np.copyto(light, cv2.GaussianBlur(light, (0, 0), PENUMBRA_PX), where=alone)
         return light
+
+    def _in_the_open(self, lit: Body, T_cam_scene: Array, point_cam: Line) -> Mask:
+        """Tell which points on a body no other body shades."""
+        low, high = (np.array([bound(component) for component in point_cam]) for bound in (np.min, np.max))
+        around = _Sphere((low + high) / 2, float(np.linalg.norm(high - low)) / 2)
+        free = np.ones(point_cam[2].shape, bool)
+        for body in self.bodies:
+            T_cam_body = T_cam_scene @ body.T_scene_body
+            caster = _Sphere.around(transform(T_cam_body, body.shape.points()))
+            if body is lit or not body.casts_shadow or not around.may_be_behind(caster, self.sun.direction_cam):
+                continue
+            T_body_cam = inverse(T_cam_body)
+            turned = _turn(T_body_cam[:3, :3], point_cam)
+            start = tuple(p + float(t) for p, t in zip(turned, T_body_cam[:3, 3], strict=True))
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                met = body.shape.hit(start, _floats(T_body_cam[:3, :3] @ self.sun.direction_cam))
+            free &= ~(met.seen & (met.depth > SHADOW_GAP_M))
+        return free
 
 
 def exposure_order(samples: int) -> tuple[int, ...]:
@@ -161,19 +168,25 @@ def exposure_order(samples: int) -> tuple[int, ...]:
     )
 
 
-def _may_shade(caster: Body, body: Body, sun_scene: Array) -> bool:
-    """Tell whether the shadow of a body's enclosing sphere can meet that of another."""
-    (centre, reach), (other, other_reach) = _sphere(caster), _sphere(body)
-    ahead = centre - other
-    behind = float(ahead @ sun_scene)
-    aside = float(np.linalg.norm(ahead - behind * sun_scene))
-    return aside < reach + other_reach and behind > -(reach + other_reach)
+@dataclass(frozen=True, eq=False)
+class _Sphere:
+    """Something that encloses points of the camera frame."""
 
+    centre_cam: Array
+    radius_m: float
 
-def _sphere(body: Body) -> tuple[Array, float]:
-    corners = transform(body.T_scene_body, body.shape.points())
-    centre = corners.mean(axis=0)
-    return centre, float(np.linalg.norm(corners - centre, axis=1).max())
+    @classmethod
+    def around(cls, points_cam: Array) -> _Sphere:
+        centre = points_cam.mean(axis=0)
+        return cls(centre, float(np.linalg.norm(points_cam - centre, axis=1).max()))
+
+    def may_be_behind(self, caster: _Sphere, to_sun_cam: Array) -> bool:
+        """Tell whether the shadow of a caster can meet this."""
+        between = caster.centre_cam - self.centre_cam
+        ahead = float(between @ to_sun_cam)
+        aside = float(np.linalg.norm(between - ahead * to_sun_cam))
+        reach = self.radius_m + caster.radius_m
+        return aside < reach and ahead > -reach
 
 
 def _only(hit: Hit, won: Mask) -> Hit:
