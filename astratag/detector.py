@@ -28,6 +28,7 @@ from astratag.search import find_quads
 from astratag.signature import ACCEPT, Artwork, Codebook, Reading, layer_cells
 from astratag.surface import Flat, Surface
 from astratag.tps import KNOTS
+from astratag.transforms import difference
 from astratag.warp import BentWarp, FittedWarp, HomographyWarp, PoseWarp
 
 Array = NDArray[np.float64]
@@ -38,8 +39,9 @@ LEAST_LIKENESS = 0.45
 """Correlation of the whole print with what is seen through a fit, below which it is something else."""
 CERTAIN_LIKENESS = 0.85
 """Likeness from which no other layer is tried."""
-OTHER_POSE_GAIN = 0.7
-"""The other planar pose is tried when it brings the corners' residual below this fraction."""
+AMBIGUOUS_RATIO, AMBIGUOUS_RMS_PX = 4.0, 0.05
+"""Both planar poses are tried when the worse fits the corners within this factor of the better, or of this residual."""
+SAME_COST, SAME_POSE_RAD = 0.98, 0.02
 NOTICEABLE_BEND = 0.02
 """A print of unknown surface is called curved from this bend on, as a fraction of its side."""
 GRID_LINES = 9
@@ -187,16 +189,19 @@ class Detector:
         return grow(view.light, begun.warp, layer)
 
     def _with_other_pose(self, view: View, detection: Detection, fit: Fit) -> Detection:
-        """Return the detection fitted again from the other planar pose when that explains its corners better."""
-        poses, rms_px = detection.planar_poses, detection.reprojection_rms_px
-        if not isinstance(fit.warp, PoseWarp) or not poses or rms_px is None:
+        """Return the detection fitted from the other planar pose when corners allow both and the edges prefer it."""
+        if not isinstance(fit.warp, PoseWarp) or len(detection.planar_poses) < 2:
             return detection
-        if poses[0].reprojection_rms_px > OTHER_POSE_GAIN * rms_px:
+        best, other = (planar.reprojection_rms_px for planar in detection.planar_poses)
+        if other > AMBIGUOUS_RATIO * max(best, AMBIGUOUS_RMS_PX):
             return detection
-        again = settle(view.light, replace(fit.warp, T_cam_marker=poses[0].T_cam_marker))
-        if again is None or again.cost >= fit.cost:
+        starts = [planar.T_cam_marker for planar in detection.planar_poses]
+        away = [T for T in starts if np.linalg.norm(difference(T, fit.warp.T_cam_marker)[3:]) > SAME_POSE_RAD]
+        fits = [settle(view.light, replace(fit.warp, T_cam_marker=T)) for T in away]
+        better = min((again for again in fits if again is not None), key=lambda again: again.cost, default=fit)
+        if better.cost >= SAME_COST * fit.cost:
             return detection
-        return self.describe(view, detection.marker_id, again, detection.method) or detection
+        return self.describe(view, detection.marker_id, better, detection.method) or detection
 
     def _starts(self, view: View, candidate: Candidate, layer: int) -> Iterator[FittedWarp]:
         """Yield warps to start fitting from when the candidate is ``layer`` of its marker."""

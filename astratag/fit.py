@@ -8,7 +8,7 @@ black-white edge the same way, and black squares and white frames feel it with o
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,8 @@ CORNER_FLOOR_PX = 0.02
 TUKEY = 4.685
 """Residuals beyond this many standard deviations weigh nothing (95 % efficiency on Gaussian noise)."""
 REWEIGHTINGS = 4
+MAX_STEPS, LINEAR_PX = 6, 0.01
+"""Gauss-Newton steps end when the last did what its derivative promised, to this many pixels."""
 SHARP_REACH_PX, LEAST_REACH_PX = 4.0, 1.2
 """An edge this far from its neighbours is sharp; nearer, they pull, and below the least it is no edge of its own."""
 LEAST_FOUND = 0.4
@@ -46,7 +48,8 @@ class EdgeFit(Generic[W]):
     ``covariance`` (P, P) is of the warp's own parameters, the bias marginalised.  ``weight`` (E, M) is each
     point's final weight, 0 where it was not used; ``offset_px`` (E, M) its distance from ``before``, the
     warp the edges were looked for with, the bias removed.  ``cost`` is the mean truncated squared residual
-    over every point in view: what alternatives are compared by.
+    over every point in view: what alternatives are compared by.  ``moved_px`` is how far the step moved the edge
+    that moved most.
     """
 
     warp: W
@@ -57,12 +60,13 @@ class EdgeFit(Generic[W]):
     sigma_px: float
     covariance: Array
     cost: float
+    moved_px: float
 
 
 def fit_edges(
     light: NDArray[np.float32], warp: W, edges: NDArray[np.int64], search_px: float, *, sharp_only: bool = False
 ) -> EdgeFit[W] | None:
-    """Return ``warp`` moved by one Gauss-Newton step onto the edges seen near it; None when too few are seen.
+    """Return ``warp`` moved onto the edges seen near it; None when too few are seen.
 
     ``sharp_only`` leaves out edges that near neighbours pull: right for the last step, not for finding the way.
     """
@@ -70,21 +74,54 @@ def fit_edges(
     use = _usable(seen, sharp_only)
     if len(set((seen.edge[use.any(axis=1)] % 4).tolist())) < 4:  # edges come in fours: sides of a square
         return None
-    template = EDGE_POINTS[seen.edge][use]
-    by_warp = (seen.normal[use][:, None, :] @ warp.jacobian(template))[:, 0]
-    A = np.column_stack([by_warp, np.ones(len(by_warp))])
+    template, normal, offset = EDGE_POINTS[seen.edge][use], seen.normal[use], seen.offset_px[use]
     share = np.broadcast_to(_independent_share(seen)[:, None], use.shape)[use]
-    delta, weight, sigma_px, covariance = _robust_least_squares(
-        A, seen.offset_px[use], share, np.append(warp.step_sigma(), BIAS_SIGMA_PX)
-    )
-    residual = seen.offset_px[use] - A @ delta
+    fitted, left, solution = _gauss_newton(warp, template, normal, offset, share)
+    residual = left - solution.x[-1]
     weights, offsets = np.zeros(use.shape), np.zeros(use.shape)
-    weights[use], offsets[use] = weight, seen.offset_px[use] - delta[-1]
+    weights[use], offsets[use] = solution.weight, offset - solution.x[-1]
     in_view = max(int((seen.in_view & (seen.reach_px >= SHARP_REACH_PX)[:, None]).sum()), len(residual))
     truncated = np.minimum((residual / COST_UNIT_PX) ** 2, COST_CAP).sum() + COST_CAP * (in_view - len(residual))
     return EdgeFit(
-        warp.stepped(delta[:-1]), warp, seen, weights, offsets, sigma_px, covariance[:-1, :-1], truncated / in_view
+        warp=fitted,
+        before=warp,
+        points=seen,
+        weight=weights,
+        offset_px=offsets,
+        sigma_px=solution.sigma_px,
+        covariance=solution.covariance[:-1, :-1],
+        cost=float(truncated / in_view),
+        moved_px=float(np.abs(offset - left).max()),
     )
+
+
+def _gauss_newton(warp: W, template: Array, normal: Array, offset: Array, share: Array) -> tuple[W, Array, _Solution]:
+    """Return the warp that brings template points (N, 2) to where they were measured, ``offset`` along ``normal``.
+
+    Also what is left of the offsets, the bias included, and the last solution.  One step does where the warp is
+    as good as linear; a small square seen nearly square-on needs more, for its tilt shows in the second order.
+    """
+    places_px = warp(template) + offset[:, None] * normal
+    left = offset
+    for _ in range(MAX_STEPS):
+        by_warp = (normal[:, None, :] @ warp.jacobian(template))[:, 0]
+        A = np.column_stack([by_warp, np.ones(len(by_warp))])
+        solution = _robust_least_squares(A, left, share, np.append(warp.step_sigma(), BIAS_SIGMA_PX))
+        expected = left - by_warp @ solution.x[:-1]
+        warp = warp.stepped(solution.x[:-1])
+        left = ((places_px - warp(template)) * normal).sum(axis=1)
+        if np.abs(left - expected).max() < LINEAR_PX:
+            break
+    return warp, left, solution
+
+
+class _Solution(NamedTuple):
+    """Unknowns (P,), final weights (N,), standard deviation of one point, covariance (P, P)."""
+
+    x: Array
+    weight: Array
+    sigma_px: float
+    covariance: Array
 
 
 def _usable(seen: EdgePoints, sharp_only: bool) -> NDArray[np.bool_]:
@@ -109,13 +146,8 @@ def _independent_share(seen: EdgePoints) -> Array:
     return np.minimum(1.0, spacing / CORRELATION_LENGTH_PX) * sharpness
 
 
-def _robust_least_squares(
-    A: Array, offset: Array, share: Array, prior_sigma: Array
-) -> tuple[Array, Array, float, Array]:
-    """Solve A x = offset with Tukey's weights, each unknown known to be 0 within ``prior_sigma`` (P,) beforehand.
-
-    Returns x, the weights, the standard deviation of one point, and the covariance of x.
-    """
+def _robust_least_squares(A: Array, offset: Array, share: Array, prior_sigma: Array) -> _Solution:
+    """Solve A x = offset with Tukey's weights, each unknown known to be 0 within ``prior_sigma`` (P,) beforehand."""
     scale = np.sqrt((A * A).sum(axis=0)) + 1e-12  # metres and radians differ by orders: solve in units of pixels
     A = A / scale
     prior = np.diag((prior_sigma * scale) ** -2.0 + 1e-9)
@@ -128,7 +160,7 @@ def _robust_least_squares(
         residual = offset - A @ x
         sigma_px = max(_spread(residual), NOISE_FLOOR_PX)
         weight = share * np.maximum(1 - (residual / (TUKEY * sigma_px)) ** 2, 0) ** 2
-    return x / scale, weight, sigma_px, np.linalg.inv(information) / np.outer(scale, scale)
+    return _Solution(x / scale, weight, sigma_px, np.linalg.inv(information) / np.outer(scale, scale))
 
 
 def _spread(residual: Array) -> float:

@@ -16,6 +16,8 @@ Fit = EdgeFit[FittedWarp]
 ALL_EDGES = np.arange(len(EDGES))
 SETTLE_PX = 2.0
 """How far from its prediction an edge is looked for once the fit has settled."""
+SETTLED_PX, MAX_SETTLING = 0.5, 4
+"""A fit that moves no edge further than this has settled."""
 MAX_SEARCH_PX = 12.0
 CURVED_GAIN = 0.6
 """A bend is believed when it lowers the cost of the fit below this fraction."""
@@ -63,7 +65,12 @@ def settle(light: Light, warp: FittedWarp) -> Fit | None:
 
     A bend needs the inner squares even where their frames are thin: the outer edges do not fix the inside.
     """
-    return fit_edges(light, warp, ALL_EDGES, SETTLE_PX, sharp_only=not isinstance(warp, BentWarp))
+    for _ in range(MAX_SETTLING):
+        fit = fit_edges(light, warp, ALL_EDGES, SETTLE_PX, sharp_only=not isinstance(warp, BentWarp))
+        if fit is None or fit.moved_px < SETTLED_PX:
+            break
+        warp = fit.warp
+    return fit
 
 
 def _search_px(warp: FittedWarp, layer: int, fraction: float) -> float:

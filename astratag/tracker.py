@@ -12,7 +12,7 @@ from astratag.candidates import OUTER
 from astratag.detection import Detection
 from astratag.detector import HALVE_FROM_PX, Detector, View, surest
 from astratag.fit import fit_edges
-from astratag.grow import ALL_EDGES, Fit, grow, settle
+from astratag.grow import ALL_EDGES, SETTLED_PX, Fit, grow, settle
 from astratag.search import find_quads
 from astratag.surface import Flat
 from astratag.transforms import difference, perturb
@@ -24,8 +24,6 @@ SEARCH_EVERY = 10
 """Frames between searches of the whole image for markers not yet tracked."""
 TRACK_PX = 6.0
 """How far from its prediction an edge may be."""
-CLOSE_PX = 0.7
-"""A fit that moved its edges less than this needs no second one."""
 COST_LIMIT = 1.0
 """Mean truncated squared residual (of 9 at most) above which a followed fit is not believed."""
 LEAST_BOX_PX = 16
@@ -123,9 +121,7 @@ class Tracker:
         if spec.surface is None:
             return grow(view.light, HomographyWarp.from_points(OUTER, warp(OUTER)), 0)
         fit = fit_edges(view.light, warp, ALL_EDGES, TRACK_PX, sharp_only=True)
-        if fit is None or np.abs(fit.offset_px[fit.weight > 0]).max(initial=0.0) < CLOSE_PX:
-            return fit
-        return settle(view.light, fit.warp)
+        return fit if fit is None or fit.moved_px < SETTLED_PX else settle(view.light, fit.warp)
 
     def _search_near(self, view: View, track: Track, box: NDArray[np.int64]) -> Detection | None:
         """Return a lost marker from a search of the part of the image it should be in."""
