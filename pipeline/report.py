@@ -245,7 +245,7 @@ def _draw_consistency(ax: Axes, run: Run, c: Columns) -> None:
     ax.axhline(1, color=MUTED, linewidth=0.8)
     ax.set_yscale("log")
     least, most = _log_limits(np.concatenate([c.nees_per_dof, nis_per_dof]))
-    ax.set_ylim(min(least, 0.2), max(most, 4.0))
+    ax.set_ylim(min(least, 0.2), 2 * max(most, 4.0))
     _plain_numbers(ax.yaxis)
     _time_axis(ax, c.t_s)
     _legend(ax)
