@@ -24,7 +24,7 @@ def main(args: argparse.Namespace) -> None:
         _run_source(args, link, stop)
         return
     mission = _mission(args.mission)
-    options = _options(args, mission, link)
+    options = _options(args, mission)
     work = _work(args, options)
     with Bus(link, vehicle=mission.vehicle, node=process.name, lossless=options.lossless) as bus:
         Shell(process, work, options, bus, stop).run()
@@ -41,9 +41,9 @@ def _mission(path: Path | None) -> Mission:
     return Mission.load(path)
 
 
-def _options(args: argparse.Namespace, mission: Mission, link: Link) -> NodeOptions:
+def _options(args: argparse.Namespace, mission: Mission) -> NodeOptions:
     companions = tuple(args.companions.split(",")) if args.companions else ()
-    return NodeOptions(mission=mission, link=link, lossless=args.lossless, companions=companions)
+    return NodeOptions(mission=mission, lossless=args.lossless, companions=companions)
 
 
 def _run_source(args: argparse.Namespace, link: Link, stop: StopSignal) -> None:
@@ -55,7 +55,8 @@ def _run_source(args: argparse.Namespace, link: Link, stop: StopSignal) -> None:
         args.source, camera=args.camera, mission=args.mission, fps=args.fps, scale_camera=args.scale_camera
     )
     source.on_warning = _warn
-    options = _options(args, source.mission, link)
+    options = _options(args, source.mission)
+    source.on_warning = _warn
     pace = Pace(speed=None if math.isinf(args.speed) else args.speed, loop=args.loop, resume=_resume(args.resume))
     with Bus(link, vehicle=source.mission.vehicle, node="source", lossless=options.lossless) as bus:
         SourceNode(source, pace, options, bus, stop).run()

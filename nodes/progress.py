@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from pipeline.convert import vector_array
-from schemas import RelativeState, Stamp
+from schemas import Envelope, RelativeState, Stamp
+from schemas.topics import STATE
 
 RATE_WINDOW_S = 1.0
 
@@ -40,6 +41,16 @@ class RunProgress:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self._progress.stop()
+
+    def write(self, envelope: Envelope, t_receipt_ns: int) -> None:
+        """Show the states among what passes: in a direct replay this is a sink like others."""
+        if envelope.topic is STATE:
+            state = envelope.message()
+            assert isinstance(state, RelativeState)
+            self.on_state(envelope.stamp, state)
+
+    def close(self) -> None:
+        """Nothing to finish."""
 
     def on_state(self, stamp: Stamp, state: RelativeState) -> None:
         """Show a state."""

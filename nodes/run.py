@@ -8,22 +8,25 @@ import math
 import socket
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from rich.console import Console
+from rich.markup import escape
 
 from astratag.dictionary import load_dictionary
 from nodes.bus import Link, free_endpoint
 from nodes.cli import EXIT_INTERRUPTED
 from nodes.processes import PROCESSES
 from nodes.progress import RunProgress
-from nodes.recorder import existing_parts, join_parts
+from nodes.recorder import join_parts
+from nodes.results import RRD, clear_results, finish_results
 from nodes.supervisor import Hooks, Outcome, Plan, RunError, Supervisor
 from pipeline.mission import Mission
 from pipeline.sources import Source, open_source
+from pipeline.steps import Sink
 
 SHIPPED_RECORDING = Path(__file__).resolve().parent.parent / "recordings" / "corridor.mcap"
 
@@ -43,67 +46,40 @@ class Subject:
 
 def replay(args: argparse.Namespace) -> int:
     """Replay a recording without losing a frame, and score it."""
-    args.recording = args.recording or _shipped_recording()
+    spec = args.recording or _shipped_recording()
     console = _console()
-    source = _open(args, args.recording)
+    source = _open(args, spec)
     if source.live:
-        raise ValueError(f"{args.recording} is a camera: use `relnav live --source {args.recording}`")
-    subject = _subject(source, args.recording)
+        raise ValueError(f"{spec} is a camera: use `relnav live --source {spec}`")
+    subject = _subject(source, spec)
     view = _view(args, console)
     speed = args.speed or (math.inf if view == "none" else 1.0)
-    _prepare(args.out, args.recording)
-    _print_header(console, subject, args, view, f"speed {'max' if math.isinf(speed) else f'{speed:g}'}")
+    speed_text = "max" if math.isinf(speed) else f"{speed:g}"
+    clear_results(args.out, spec)
+    _print_header(console, subject, args, view, f"speed {speed_text}")
     if args.direct:
         outcome = _run_direct(args, source, view, speed, console)
     else:
         del source
-        own_link, node_link = _links(args.connect, free_endpoint())
-        with _mission_file(subject.mission) as mission_path:
-            plan = Plan(
-                processes=PROCESSES,
-                arguments=_arguments(args, args.recording, view)
-                | {"source": [*_source_arguments(args, args.recording), "--speed", _speed_text(speed)]},
-                node_link=node_link,
-                own_link=own_link,
-                vehicle=subject.mission.vehicle,
-                lossless=True,
-                mission_path=mission_path,
-            )
-            outcome = _run(plan, subject.frame_count, console)
-    _finish(args.out, subject.mission, outcome, console)
-    if not outcome.completed:
-        print("relnav: error: interrupted; what was recorded until then is kept", file=sys.stderr)
-        return EXIT_INTERRUPTED
-    return 0
+        links = _links(args.connect, free_endpoint())
+        with _plan(args, subject, view, links, ["--speed", speed_text], lossless=True) as plan:
+            outcome = _run(plan, subject, args.out, console)
+    return _conclude(args.out, subject, outcome, console)
 
 
 def live(args: argparse.Namespace) -> int:
     """Navigate on a camera, or on a file as if it were one, until it ends, the time is up or Ctrl-C."""
     console = _console()
-    source = _open(args, args.source)
-    subject = _subject(source, args.source)
-    del source  # a camera is given back for the source node
+    subject = _subject(_open(args, args.source), args.source)
     view = _view(args, console)
-    _prepare(args.out, args.source)
-    own_link, node_link = _links(args.connect, args.listen)
-    where = f"router {args.connect}" if args.connect else f"bus {args.listen}"
-    _print_header(console, subject, args, view, where)
-    with _mission_file(subject.mission) as mission_path:
-        loop = ["--loop"] if args.loop else []
-        plan = Plan(
-            processes=PROCESSES,
-            arguments=_arguments(args, args.source, view) | {"source": [*_source_arguments(args, args.source), *loop]},
-            node_link=node_link,
-            own_link=own_link,
-            vehicle=subject.mission.vehicle,
-            lossless=False,
-            mission_path=mission_path,
-            duration_s=args.duration,
-        )
-        outcome = _run(plan, None if args.loop or args.duration else subject.frame_count, console)
-    _finish(args.out, subject.mission, outcome, console)
-    endless = (subject.live or args.loop) and args.duration is None  # ends no other way
-    return 0 if outcome.completed or endless else EXIT_INTERRUPTED
+    clear_results(args.out, args.source)
+    _print_header(console, subject, args, view, f"router {args.connect}" if args.connect else f"bus {args.listen}")
+    links = _links(args.connect, args.listen)
+    with _plan(args, subject, view, links, ["--loop"] if args.loop else [], lossless=False) as plan:
+        outcome = _run(plan, subject, args.out, console)
+    if (subject.live or args.loop) and args.duration is None:
+        outcome = Outcome(completed=True, died=outcome.died)  # Ctrl-C is how such a run ends
+    return _conclude(args.out, subject, outcome, console)
 
 
 def _console() -> Console:
@@ -132,21 +108,24 @@ def _subject(source: Source, spec: str) -> Subject:
 
 def _view(args: argparse.Namespace, console: Console) -> View:
     """Decide where the run is shown.  Raises ValueError when a page is asked for and its ports are taken."""
-    view: str = args.view
-    if view == "auto":
+    if args.view == "auto":
         from pipeline.view import has_display
 
-        view = "native" if has_display() else "web" if console.is_terminal else "none"
-        if view == "web":
-            args.web_port, args.grpc_port = (
-                port if _is_free(port) else int(free_endpoint().rpartition(":")[2])
-                for port in (args.web_port, args.grpc_port)
-            )
-    if view == "web":
+        if has_display():
+            return "native"
+        if not console.is_terminal:
+            return "none"
+        args.web_port, args.grpc_port = (
+            port if _is_free(port) else int(free_endpoint().rpartition(":")[2])
+            for port in (args.web_port, args.grpc_port)
+        )
+        return "web"
+    if args.view == "web":
         for flag, port in (("--web-port", args.web_port), ("--grpc-port", args.grpc_port)):
             if not _is_free(port):
                 raise ValueError(f"port {port} is in use: stop the other viewer, or choose another port with {flag}")
-    return view  # type: ignore[return-value]
+    view: View = args.view
+    return view
 
 
 def _is_free(port: int) -> bool:
@@ -159,19 +138,6 @@ def _is_free(port: int) -> bool:
     return True
 
 
-def _prepare(out: Path, spec: str) -> None:
-    """Make the folder and take away the files of an earlier run, and only those."""
-    stale = [*existing_parts(out), *(out / name for name in ("run.rrd", "summary.json", "report.png"))]
-    if Path(spec).resolve() in [path.resolve() for path in stale]:
-        raise ValueError(f"{spec} would be overwritten by its own replay: choose another folder with --out")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        for path in stale:
-            path.unlink(missing_ok=True)
-    except OSError as error:
-        raise ValueError(f"cannot write to {out}: {error.strerror}") from error
-
-
 def _links(connect: str | None, listen: str) -> tuple[Link, Link]:
     """Return the supervisor's link and the nodes'."""
     if connect:
@@ -180,46 +146,59 @@ def _links(connect: str | None, listen: str) -> tuple[Link, Link]:
 
 
 @contextlib.contextmanager
-def _mission_file(mission: Mission) -> Iterator[str]:
-    with tempfile.TemporaryDirectory(prefix="relnav-") as directory:
-        path = Path(directory) / "mission.json"
-        path.write_text(mission.to_json())
-        yield str(path)
-
-
-def _source_arguments(args: argparse.Namespace, spec: str) -> list[str]:
-    arguments = ["--source", spec]
-    if args.camera:
-        arguments += ["--camera", str(args.camera)]
-    if args.fps:
-        arguments += ["--fps", str(args.fps)]
-    return arguments + (["--scale-camera"] if args.scale_camera else [])
-
-
-def _arguments(args: argparse.Namespace, spec: str, view: View) -> dict[str, list[str]]:
+def _plan(
+    args: argparse.Namespace,
+    subject: Subject,
+    view: View,
+    links: tuple[Link, Link],
+    source_arguments: Sequence[str],
+    *,
+    lossless: bool,
+) -> Iterator[Plan]:
+    """Yield the plan of a run; the nodes' mission file lasts as long."""
+    source = ["--source", subject.spec, *source_arguments]
+    for flag, value in (("--camera", args.camera), ("--fps", args.fps)):
+        source += [flag, str(value)] if value else []
+    source += ["--scale-camera"] if args.scale_camera else []
     ports = ["--web-port", str(args.web_port), "--grpc-port", str(args.grpc_port)]
-    return {"recorder": ["--out", str(args.out)], "viewer": ["--out", str(args.out), "--view", view, *ports]}
-
-
-def _speed_text(speed: float) -> str:
-    return "max" if math.isinf(speed) else str(speed)
+    out = ["--out", str(args.out)]
+    own_link, node_link = links
+    with tempfile.TemporaryDirectory(prefix="relnav-") as directory:
+        mission_path = Path(directory) / "mission.json"
+        mission_path.write_text(subject.mission.to_json())
+        yield Plan(
+            processes=PROCESSES,
+            arguments={"source": source, "recorder": out, "viewer": [*out, "--view", view, *ports]},
+            node_link=node_link,
+            own_link=own_link,
+            vehicle=subject.mission.vehicle,
+            lossless=lossless,
+            mission_path=str(mission_path),
+            duration_s=None if lossless else args.duration,
+        )
 
 
 def _print_header(console: Console, subject: Subject, args: argparse.Namespace, view: View, how: str) -> None:
     frames = "live" if subject.frame_count is None else f"{subject.frame_count} frames"
-    console.print(f"[bold]{subject.spec}[/bold]: {frames}, {how}, results in {args.out}")
+    console.print(f"[bold]{escape(subject.spec)}[/bold]: {frames}, {how}, results in {escape(str(args.out))}")
     if view == "native":
         console.print("Rerun's window opens beside this")
     elif view == "web":
         data = f"rerun%2Bhttp%3A%2F%2Flocalhost%3A{args.grpc_port}%2Fproxy"
         console.print(f"watch it at http://localhost:{args.web_port}/?url={data}")
     for warning in subject.warnings:
-        console.print(f"warning: {warning}", style="yellow")
+        console.print(f"warning: {warning}", style="yellow", markup=False)
 
 
-def _run(plan: Plan, frame_count: int | None, console: Console) -> Outcome:
-    with RunProgress(console, frame_count) as progress:
-        return Supervisor(plan, Hooks(progress.on_state, progress.on_note)).run()
+def _run(plan: Plan, subject: Subject, out: Path, console: Console) -> Outcome:
+    endless = not plan.lossless and ("--loop" in plan.arguments["source"] or plan.duration_s is not None)
+    try:
+        with RunProgress(console, None if endless else subject.frame_count) as progress:
+            return Supervisor(plan, Hooks(progress.on_state, progress.on_note)).run()
+    except RunError:
+        with contextlib.suppress(ValueError):
+            join_parts(out, subject.mission)  # what was recorded until then stays readable
+        raise
 
 
 def _run_direct(args: argparse.Namespace, source: Source, view: View, speed: float, console: Console) -> Outcome:
@@ -228,50 +207,28 @@ def _run_direct(args: argparse.Namespace, source: Source, view: View, speed: flo
     from pipeline.view import Viewer
 
     with RunProgress(console, source.frame_count) as progress, contextlib.ExitStack() as stack:
-        recorder = stack.enter_context(RecordingWriter(args.out / "run.mcap", source.mission))
-        viewer = stack.enter_context(
-            Viewer(
-                source.mission,
-                rrd_path=args.out / "run.rrd",
-                mode=view,
-                web_port=args.web_port,
-                grpc_port=args.grpc_port,
-                warn=lambda text: progress.on_note(f"warning: {text}"),
-            )
-        )
-        source.on_warning = lambda text: progress.on_note(f"warning: {text}")
+
+        def warn(text: str) -> None:
+            progress.on_note(f"warning: {text}")
+
+        source.on_warning = warn
+        ports = {"web_port": args.web_port, "grpc_port": args.grpc_port}
+        viewer = Viewer(source.mission, rrd_path=args.out / RRD, mode=view, warn=warn, **ports)
+        recorder = RecordingWriter(args.out / "run.mcap", source.mission)
+        sinks: list[Sink] = [stack.enter_context(viewer), stack.enter_context(recorder), progress]
         try:
-            replay_direct(source, [recorder, viewer], speed="max" if math.isinf(speed) else speed)
+            replay_direct(source, sinks, speed="max" if math.isinf(speed) else speed)
         except KeyboardInterrupt:
             return Outcome(completed=False, died=frozenset())
     return Outcome(completed=True, died=frozenset())
 
 
-def _finish(out: Path, mission: Mission, outcome: Outcome, console: Console) -> None:
-    """Make recording and .rrd whole, score the run, write summary and report, print the table and what to try next."""
-    from pipeline.report import write_report
-    from pipeline.scoring import print_table, score, write_summary
-
-    recording = join_parts(out, mission)
-    if "viewer" in outcome.died:
-        _draw_again(recording, out / "run.rrd")
-    try:
-        summary = score(recording)
-    except ValueError as error:
-        raise RunError(f"the run cannot be scored: {error}") from error
-    write_summary(summary, out / "summary.json")
-    write_report(recording, summary, out / "report.png")
-    print_table(summary, console)
-    console.print(f"written: {recording}, {out / 'run.rrd'}, {out / 'summary.json'}, {out / 'report.png'}")
-    console.print(f"try next: [bold]{Path(sys.prefix, 'bin', 'rerun')} {out / 'run.rrd'}[/bold]")
-
-
-def _draw_again(recording: Path, rrd_path: Path) -> None:
-    """Write the .rrd from the recording: the viewer did not see all of the run."""
-    from pipeline.recording import Recording
-    from pipeline.view import Viewer
-
-    recorded = Recording(recording)
-    with Viewer(recorded.mission, rrd_path=rrd_path, mode="none") as viewer:
-        for envelope, t_receipt_ns in recorded.envelopes():
-            viewer.write(envelope, t_receipt_ns)
+def _conclude(out: Path, subject: Subject, outcome: Outcome, console: Console) -> int:
+    """Write and print the results; of a run that was interrupted, what there is of them."""
+    if outcome.completed:
+        finish_results(out, subject.mission, outcome, console)
+        return 0
+    with contextlib.suppress(ValueError):  # interrupted before there was anything to score
+        finish_results(out, subject.mission, outcome, console)
+    print("relnav: error: interrupted; what was recorded until then is kept", file=sys.stderr)
+    return EXIT_INTERRUPTED

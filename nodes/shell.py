@@ -23,7 +23,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
-from nodes.bus import Bus, Credit, Link, Presence, Received
+from nodes.bus import Bus, Credit, Presence, Received
 from nodes.health import Health
 from nodes.processes import Process, consumers, producers
 from pipeline.mission import Mission
@@ -32,7 +32,7 @@ from schemas.topics import HEALTH
 
 POLL_S = 0.05
 IDLE_PERIOD_S = 0.1
-JOIN_PATIENCE_S = 30.0
+JOIN_PATIENCE_S = 60.0
 """For the nodes behind to come up: imports on a small busy machine take seconds."""
 END_PATIENCE_S = 10.0
 LATCH_PATIENCE_S = 10.0
@@ -47,7 +47,6 @@ class NodeOptions:
     """What every node is told at its start."""
 
     mission: Mission
-    link: Link
     lossless: bool
     companions: tuple[str, ...] = ()
     """Names of the nodes that take part in a replay, and that it waits for."""

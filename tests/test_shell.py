@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from nodes import shell as shell_module
-from nodes.bus import Credit, Event, Link, Presence, Received
+from nodes.bus import Credit, Event, Presence, Received
 from nodes.processes import process_named
 from nodes.shell import NodeError, NodeOptions, Shell
 from pipeline.mission import Mission
@@ -84,7 +84,7 @@ def arrived(topic: Topic, sequence: int, payload: bytes = b"x") -> Received:
 
 def run(*events: Event, node: str = "detector", lossless: bool = True, companions: tuple[str, ...] = ()):
     bus, work = ScriptedBus(*events), Echo(STATE if node == "pose_filter" else DETECTIONS)
-    options = NodeOptions(Mission(), Link("", "peer"), lossless, companions)
+    options = NodeOptions(Mission(), lossless, companions)
     shell = Shell(process_named(node), work, options, bus, bus)  # type: ignore[arg-type]
     shell._health._due_s = 0.0
     shell.run()

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
 from nodes import source as source_module
-from nodes.bus import Credit, Event, Link, Presence
+from nodes.bus import Credit, Event, Presence
 from nodes.shell import NodeOptions
 from nodes.source import WINDOW, Pace, Resume, SourceNode, repeated, retimed
 from pipeline.mission import Mission
@@ -108,7 +108,7 @@ class Film:
 
 
 def play(frames: int, others: Others, *, lossless: bool = True, pace: Pace) -> None:
-    options = NodeOptions(Mission(), Link("", "peer"), lossless, others.names)
+    options = NodeOptions(Mission(), lossless, others.names)
     SourceNode(Film(frames), pace, options, others, others).run()  # type: ignore[arg-type]
 
 
@@ -127,7 +127,7 @@ def test_a_viewer_that_dies_is_not_waited_for():
     others.names = ("recorder",)
     others.events += [Presence("viewer", alive=False)]
     others.acknowledged.pop("viewer")
-    options = NodeOptions(Mission(), Link("", "peer"), True, ("recorder", "viewer"))
+    options = NodeOptions(Mission(), True, ("recorder", "viewer"))
     SourceNode(Film(20), Pace(speed=None), options, others, others).run()  # type: ignore[arg-type]
     assert len(others.published) == 20
 

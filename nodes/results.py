@@ -1,0 +1,72 @@
+"""What a run leaves behind: one whole recording, its .rrd, its score, its report, and a word on what to try next."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
+
+from nodes.recorder import existing_parts, join_parts
+from nodes.supervisor import Outcome
+from pipeline.mission import Mission
+
+RRD, SUMMARY, REPORT = "run.rrd", "summary.json", "report.png"
+
+
+def clear_results(out: Path, spec: str) -> None:
+    """Make the folder and take away the files of an earlier run, and only those.
+
+    Raises ValueError when the source itself is one of them, or the folder cannot be written.
+    """
+    stale = [*existing_parts(out), *(out / name for name in (RRD, SUMMARY, REPORT))]
+    if Path(spec).resolve() in [path.resolve() for path in stale]:
+        raise ValueError(f"{spec} would be overwritten by its own replay: choose another folder with --out")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for path in stale:
+            path.unlink(missing_ok=True)
+    except OSError as error:
+        raise ValueError(f"cannot write to {out}: {error.strerror}") from error
+
+
+def finish_results(out: Path, mission: Mission, outcome: Outcome, console: Console) -> None:
+    """Make recording and .rrd whole, score the run, write summary and report, and print the table.
+
+    Raises ValueError when the run left nothing to score.
+    """
+    from pipeline.report import write_report
+    from pipeline.scoring import print_table, score, write_summary
+
+    recording = join_parts(out, mission)
+    if "viewer" in outcome.died:
+        _draw_again(recording, out / RRD)
+    summary = score(recording)
+    write_summary(summary, out / SUMMARY)
+    write_report(recording, summary, out / REPORT)
+    print_table(summary, console)
+    written = ", ".join(escape(str(path)) for path in (recording, out / RRD, out / SUMMARY, out / REPORT))
+    console.print(f"written: {written}")
+    console.print(f"try next: [bold]{escape(_rerun_command(out / RRD))}[/bold]")
+
+
+def _rerun_command(rrd_path: Path) -> str:
+    """Return the command that opens a .rrd: in Rerun's window, or in a browser where no window can open."""
+    from pipeline.view import has_display
+
+    program = Path(sys.prefix, "bin", "rerun")
+    if program.is_relative_to(Path.cwd()):
+        program = program.relative_to(Path.cwd())
+    return f"{program} {rrd_path}" if has_display() else f"{program} --web-viewer {rrd_path}"
+
+
+def _draw_again(recording: Path, rrd_path: Path) -> None:
+    """Write the .rrd from the recording: the viewer did not see all of the run."""
+    from pipeline.recording import Recording
+    from pipeline.view import Viewer
+
+    recorded = Recording(recording)
+    with Viewer(recorded.mission, rrd_path=rrd_path, mode="none") as viewer:
+        for envelope, t_receipt_ns in recorded.envelopes():
+            viewer.write(envelope, t_receipt_ns)
