@@ -1,0 +1,191 @@
+"""The detector on renders with known truth, on the real frames, and on images that are not what they should be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from astratag import Camera, Cylinder, Detection, Detector, Flat, MarkerSpec, Surface, annotate, load_dictionary
+from astratag.geometry import LAYERS, square
+from astratag.transforms import difference, exp_so3, pose
+from astratag.warp import PoseWarp
+from pipeline.render import render_marker
+
+DICTIONARY = load_dictionary()
+CAMERA = Camera([[1000, 0, 639.5], [0, 1000, 359.5], [0, 0, 1]], width=1280, height=720)
+CYLINDER = Cylinder(0.15)
+FACING = np.diag([1.0, -1.0, -1.0])
+
+
+def photograph(
+    T_cam_marker: np.ndarray, surface: Surface, marker_id: int = 19, seed: int = 0, **kwargs: object
+) -> np.ndarray:
+    """Return a render through JPEG of quality 90."""
+    image = render_marker(
+        CAMERA,
+        T_cam_marker,
+        signature=DICTIONARY.signature(marker_id),
+        side_m=0.1,
+        surface=surface,
+        seed=seed,
+        **kwargs,
+    )
+    return cv2.imdecode(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 90])[1], cv2.IMREAD_GRAYSCALE)
+
+
+def tumbled(range_m: float, seed: int, tilt_rad: float = 0.25) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=3) * (1, 1, 2)
+    R = FACING @ exp_so3(axis / np.linalg.norm(axis) * rng.uniform(0.05, tilt_rad))
+    return pose(R, [*(rng.uniform(-0.06, 0.06, 2) * range_m), range_m])
+
+
+def one(detections: list[Detection]) -> Detection:
+    assert [seen.marker_id for seen in detections] == [19]
+    return detections[0]
+
+
+def corner_errors(seen: Detection, T_cam_marker: np.ndarray, surface: Surface) -> list[np.ndarray]:
+    """Return the corners' errors (4, 2) of each layer in units of its sigma."""
+    warp = PoseWarp(CAMERA, 0.1, surface, T_cam_marker)
+    return [(s.corners_px - warp(square(*LAYERS[s.layer].black))) / s.sigma_px for s in seen.layers]
+
+
+@pytest.mark.parametrize("surface", [Flat(), CYLINDER], ids=["flat", "cylinder"])
+def test_pose_and_corners_are_right_and_honest_from_far_to_near(surface: Surface) -> None:
+    """From 1.5 m to 6 cm: identity, one detection, position to 0.3 % of range, NEES and corner chi-square near one."""
+    detector, nees, squares = Detector(surface=surface), [], []
+    ranges = (1.5, 1.2, 0.9, 0.7, 0.5, 0.35, 0.25, 0.08)
+    for seed, range_m in enumerate(ranges):
+        T = tumbled(range_m, seed)
+        seen = one(detector.detect(photograph(T, surface, seed=seed), CAMERA))
+        assert seen.method == ("planar" if surface == Flat() else "cylinder")
+        error = difference(T, seen.T_cam_marker)
+        assert np.linalg.norm(error[:3]) < 0.003 * range_m
+        assert np.linalg.norm(error[3:]) < np.radians(2.0 if range_m > 0.5 else 0.5)
+        nees.append(error @ np.linalg.solve(seen.covariance, error) / 6)
+        squares += [np.mean(e**2) for e in corner_errors(seen, T, surface)]
+    assert 0.2 < np.mean(nees) < 3.0
+    assert 0.1 < np.mean(squares) < 2.0
+
+
+def test_the_outer_square_may_be_out_of_view() -> None:
+    """At 6 cm only inner layers fit the image: the outer square is predicted and the depth still right."""
+    T = pose(FACING @ exp_so3([0.05, -0.1, 0.3]), [0.004, -0.002, 0.06])
+    seen = one(Detector(surface=CYLINDER).detect(photograph(T, CYLINDER), CAMERA))
+    assert 0 not in {layer.layer for layer in seen.layers} and 2 in {layer.layer for layer in seen.layers}
+    assert np.linalg.norm(difference(T, seen.T_cam_marker)[:3]) < 1e-4
+    truth = PoseWarp(CAMERA, 0.1, CYLINDER, T)(square(0, 700))
+    assert np.abs(seen.corners_px - truth).max() < 2.0
+    assert truth.min() < 0
+
+
+@pytest.mark.parametrize("turn_deg", [0, 45, 90, 137, 180, 270])
+def test_corners_come_in_the_markers_own_order_at_any_roll(turn_deg: int) -> None:
+    T = pose(FACING @ exp_so3([0.0, 0.0, np.radians(turn_deg)]) @ exp_so3([0.5, 0.0, 0.0]), [0.0, 0.0, 0.6])
+    seen = one(Detector().detect(photograph(T, Flat())))
+    np.testing.assert_allclose(seen.corners_px, PoseWarp(CAMERA, 0.1, Flat(), T)(square(0, 700)), atol=0.3)
+    assert seen.T_cam_marker is None and seen.covariance is None and seen.planar_poses == ()
+
+
+def test_a_print_on_an_undescribed_cylinder_is_read_and_its_grid_follows_it() -> None:
+    """Radius 1.5 sides seen at 45 degrees, surface unknown."""
+    T = pose(FACING @ exp_so3([0.8, 0.0, 0.0]), [0.0, 0.0, 0.6])
+    seen = one(Detector().detect(photograph(T, CYLINDER)))
+    assert seen.method == "tps"
+    span = np.linspace(0, 700, 9)
+    truth = PoseWarp(CAMERA, 0.1, CYLINDER, T)(np.stack(np.meshgrid(span, span), axis=-1))
+    assert seen.warp_grid_px.shape == (9, 9, 2)
+    assert np.sqrt(((seen.warp_grid_px - truth) ** 2).sum(axis=-1).mean()) < 2.0
+
+
+def test_two_prints_of_one_identity_are_two_detections() -> None:
+    left, right = (photograph(pose(FACING, [x, 0.0, 0.8]), Flat()) for x in (-0.15, 0.15))
+    both = np.hstack([left[:, :640], right[:, 640:]])
+    found = Detector(surface=Flat()).detect(both, CAMERA)
+    assert [seen.marker_id for seen in found] == [19, 19]
+    x = sorted(seen.T_cam_marker[0, 3] for seen in found)
+    np.testing.assert_allclose(x, [-0.15, 0.15], atol=1e-3)
+
+
+def test_each_marker_has_the_side_and_surface_it_was_listed_with() -> None:
+    T = tumbled(0.6, seed=3)
+    detector = Detector(side_m=0.5, markers={19: MarkerSpec(side_m=0.1, surface=CYLINDER)})
+    seen = one(detector.detect(photograph(T, CYLINDER), CAMERA))
+    assert seen.method == "cylinder"
+    assert np.linalg.norm(difference(T, seen.T_cam_marker)[:3]) < 1e-3
+
+
+def test_linear_light_needs_to_be_told() -> None:
+    T = tumbled(0.8, seed=5)
+    image = photograph(T, Flat(), encoding="linear")
+    told, untold = (
+        one(Detector(surface=Flat(), transfer=transfer).detect(image, CAMERA)) for transfer in ("linear", "srgb")
+    )
+    errors = [np.abs(difference(T, seen.T_cam_marker)[2]) for seen in (told, untold)]
+    assert errors[0] < 5e-4 < errors[1]
+
+
+def test_the_same_image_gives_the_same_detection() -> None:
+    image = photograph(tumbled(0.5, seed=2), CYLINDER)
+    detector = Detector(surface=CYLINDER)
+    first, second = one(detector.detect(image, CAMERA)), one(Detector(surface=CYLINDER).detect(image, CAMERA))
+    np.testing.assert_array_equal(first.T_cam_marker, second.T_cam_marker)
+    np.testing.assert_array_equal(first.corners_px, second.corners_px)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_images_without_a_marker_give_none_and_do_not_raise(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    noise = rng.integers(0, 256, (240, 320), dtype=np.uint8)
+    blobs = ((cv2.GaussianBlur(noise, (0, 0), 3.0) > 127) * 255).astype(np.uint8)
+    board = ((np.indices((240, 320)) // 20).sum(axis=0) % 2 * 255).astype(np.uint8)
+    camera = Camera([[300, 0, 160], [0, 300, 120], [0, 0, 1]], width=320, height=240)
+    for image in (noise, blobs, board, np.zeros((240, 320), np.uint8), np.full((9, 9), 255, np.uint8)):
+        for detector in (Detector(), Detector(surface=CYLINDER)):
+            assert detector.detect(image, camera if image.shape == (240, 320) else None) == []
+
+
+@pytest.mark.parametrize(
+    ("image", "camera", "message"),
+    [
+        (np.zeros((720, 1280)), None, "uint8"),
+        (np.zeros((720, 1280, 4), np.uint8), None, "shape"),
+        (np.zeros((0, 0), np.uint8), None, "shape"),
+        (None, None, "NoneType"),
+        (np.zeros((480, 640), np.uint8), CAMERA, "1280x720"),
+    ],
+)
+def test_what_is_not_an_image_is_refused_with_a_reason(image: np.ndarray, camera: Camera | None, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Detector().detect(image, camera)
+
+
+def test_impossible_detectors_are_refused() -> None:
+    with pytest.raises(ValueError, match="side_m"):
+        Detector(side_m=0.0)
+    with pytest.raises(ValueError, match="marker 77"):
+        Detector(markers={77: MarkerSpec(0.1)})
+    with pytest.raises(ValueError, match="transfer"):
+        Detector(transfer="gamma")  # type: ignore[arg-type]
+
+
+REAL_LAYERS = {"0000": 0, "0043": 0, "0056": 1, "0083": 0, "0086": 0}
+"""The outermost layer that is whole in each real frame; 0056 cuts the outer square."""
+
+
+@pytest.mark.parametrize("name", REAL_LAYERS)
+def test_real_frames_read_as_marker_19_with_the_right_layers(shared: Path, name: str) -> None:
+    image = cv2.imread(str(shared / "reference" / "frames" / f"frame_{name}.png"))
+    seen = one(Detector().detect(image))
+    assert min(layer.layer for layer in seen.layers) == REAL_LAYERS[name]
+    picture = annotate(image, [seen])
+    assert picture.shape == image.shape and (picture != image).any()
+
+
+def test_the_frame_of_a_marker_too_faint_gives_nothing_false(shared: Path) -> None:
+    image = cv2.imread(str(shared / "reference" / "frames" / "frame_0098.png"))
+    assert all(seen.marker_id == 19 for seen in Detector().detect(image))
