@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
+from operator import index
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from astratag.geometry import CELLS, turn_clockwise
+from astratag.codes.algebraic import Rejected
+from astratag.codes.families import FAMILIES
+from astratag.codes.family import REGION_CELLS, Family
+from astratag.codes.soft import Reading, decide, kept_cells
+from astratag.codes.words import pack
+from astratag.geometry import CELLS, square, turn_clockwise
 
 ORIENTATIONS = ("0", "90", "180", "270")
 """Names of the four readings: "90" is what the print reads when turned clockwise by 90 degrees."""
+
+PUBLISHED = "astratag20"
+LARGEST = 1 << 16
+"""Most identities a dictionary may hold: each is compared with everything seen."""
 
 PUBLISHED_MESSAGES = (
     (0x3AD948, 0x6A7C47, 0x928B3A, 0x5ED181, 0x21A31B, 0xBDEC98, 0x671123, 0x89BCCD, 0x91C6B9, 0x58238B)
@@ -36,7 +48,7 @@ def published_signature(message: int) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True, eq=False)
 class Dictionary:
-    """A set of marker codes.
+    """A set of marker codes: the *active set*, what a detector looks for.
 
     ``signatures`` is (N, 48), uint8, 1 for a white cell, upright; ``ids`` gives each row's marker id.
     """
@@ -59,8 +71,7 @@ class Dictionary:
         object.__setattr__(self, "signatures", signatures)
         if len(set(self.ids)) != len(self.ids):
             raise ValueError(f"dictionary {self.family!r} lists an id twice")
-        rows = self.oriented.reshape(-1, CELLS)
-        if len(np.unique(rows, axis=0)) != len(rows):
+        if len(np.unique(self._words)) != self._words.size:
             raise ValueError(
                 f"dictionary {self.family!r} has colliding signatures: two ids, or two turns of one, read the same"
             )
@@ -74,24 +85,70 @@ class Dictionary:
         return np.stack([turn_clockwise(self.signatures, k) for k in range(4)], axis=1)
 
     @cached_property
+    def _words(self) -> NDArray[np.uint64]:
+        """All readings (N, 4) packed into words."""
+        return pack(self.oriented)
+
+    @cached_property
+    def _codes(self) -> NDArray[np.float64]:
+        """All readings (4 N, 48), ready to be multiplied with brightnesses."""
+        return self.oriented.reshape(-1, CELLS).astype(float)
+
+    @cached_property
+    def _row(self) -> dict[int, int]:
+        """The row of each id."""
+        return {marker_id: row for row, marker_id in enumerate(self.ids)}
+
+    @cached_property
     def minimum_distance(self) -> int:
         """Smallest Hamming distance between any two readings, of one marker or of two."""
-        rows = self.oriented.reshape(-1, CELLS).astype(np.int64)
-        distance = (rows[:, None, :] != rows[None, :, :]).sum(axis=2)
-        return int(distance[~np.eye(len(rows), dtype=bool)].min())
+        least = CELLS
+        for row, upright in enumerate(self._words[:, 0]):  # turning both of a pair changes nothing
+            distance = np.bitwise_count(self._words[row:] ^ upright)
+            distance[0, 0] = CELLS
+            least = min(least, int(distance.min()))
+        return least
 
-    def signature(self, marker_id: int) -> NDArray[np.uint8]:
-        """Return the upright code (48,) of an id.  Raises ValueError for an id that is not in the dictionary."""
-        if marker_id not in self.ids:
+    def row(self, marker_id: int) -> int:
+        """Return the row of an id.  Raises ValueError for an id that is not in the dictionary."""
+        if marker_id not in self._row:
             raise ValueError(
                 f"marker {marker_id} is not in dictionary {self.family!r} (ids {min(self.ids)}-{max(self.ids)})"
             )
-        return self.signatures[self.ids.index(marker_id)]
+        return self._row[marker_id]
+
+    def signature(self, marker_id: int) -> NDArray[np.uint8]:
+        """Return the upright code (48,) of an id.  Raises ValueError for an id that is not in the dictionary."""
+        return self.signatures[self.row(marker_id)]
+
+    def restricted(self, ids: Iterable[int]) -> Dictionary:
+        """Return the dictionary of some of the ids.  Raises ValueError for none, an unknown one, or one twice."""
+        chosen = _integers(ids)
+        return Dictionary(self.family, chosen, self.signatures[[self.row(i) for i in chosen]])
+
+    def decode(
+        self, cells: NDArray[np.float64], erased: ArrayLike | None = None, *, threshold: float | None = None
+    ) -> Reading | Rejected:
+        """Return the reading that correlates best with brightnesses (48,), of all there are: maximum likelihood.
+
+        ``erased`` (8,) booleans name regions that do not count, TL, TR, BR, BL, L, T, R, B of the image.
+        ``threshold`` is the least correlation to accept, by default the one that chance passes once in a million
+        candidates.  Raises ValueError for cells or flags of another shape, or cells that are not finite.
+        """
+        kept = kept_cells(cells, erased, REGION_CELLS)
+        return decide(
+            cells,
+            kept,
+            self._codes,
+            lambda n: (self.ids[n // 4], n % 4),
+            readings=self._words.size,
+            threshold=threshold,
+        )
 
 
 def _published() -> Dictionary:
     signatures = np.array([published_signature(m) for m in PUBLISHED_MESSAGES])
-    return Dictionary("astratag20", tuple(range(len(PUBLISHED_MESSAGES))), signatures)
+    return Dictionary(PUBLISHED, tuple(range(len(PUBLISHED_MESSAGES))), signatures)
 
 
 def _from_json(path: Path) -> Dictionary:
@@ -121,14 +178,83 @@ def _from_json(path: Path) -> Dictionary:
     return dictionary
 
 
-def load_dictionary(name: str | Path = "astratag20") -> Dictionary:
-    """Return a dictionary by name ("astratag20") or from a file in the reference's JSON format.
+def load_dictionary(name: str | Path = PUBLISHED, ids: Iterable[int] | None = None) -> Dictionary:
+    """Return a dictionary by name, or from a file in the reference's JSON format, whole or only some ``ids`` of it.
 
-    Raises ValueError for an unknown name, an unreadable file or colliding signatures.
+    Names are the published "astratag20" and the families of ``astratag.codes``; "astratag48h12:0-99,205" is short
+    for the same with ids.  Raises ValueError for an unknown name, an unreadable file, colliding signatures, ids
+    that are not there, or a whole family too large to look for.
     """
-    if name == "astratag20":
-        return _published()
-    path = Path(name)
-    if path.is_file():
-        return _from_json(path)
-    raise ValueError(f"unknown dictionary {str(name)!r}: neither a family (astratag20) nor a JSON file that exists")
+    source, colon, listed = str(name).rpartition(":")
+    if not colon or Path(name).is_file():
+        source = str(name)
+    elif ids is None:
+        ids = _listed_ids(listed, str(name))
+    else:
+        raise ValueError(f"ids are given twice: in the name {str(name)!r} and as ids")
+    if source in FAMILIES:
+        return _of_family(FAMILIES[source], ids)
+    if source == PUBLISHED:
+        whole = _published()
+    elif Path(source).is_file():
+        whole = _from_json(Path(source))
+    else:
+        known = ", ".join((PUBLISHED, *FAMILIES))
+        raise ValueError(f"unknown dictionary {source!r}: neither a family ({known}) nor a JSON file that exists")
+    return whole if ids is None else whole.restricted(ids)
+
+
+def _of_family(family: Family, ids: Iterable[int] | None) -> Dictionary:
+    """Return the dictionary of a family's ids, all of them when None."""
+    if ids is None and len(family) > LARGEST:
+        raise ValueError(
+            f"{family.name} has {len(family)} identities, too many to look for: name those in use, as in "
+            f"'{family.name}:0-99'"
+        )
+    chosen = tuple(range(len(family))) if ids is None else _integers(ids)
+    return Dictionary(family.name, chosen, family.signatures(np.array(chosen, dtype=np.int64)))
+
+
+def _integers(ids: Iterable[int]) -> tuple[int, ...]:
+    try:
+        return tuple(index(i) for i in ids)
+    except TypeError as error:
+        raise ValueError(f"ids must be a list of integers, got {ids!r}") from error
+
+
+def _listed_ids(text: str, name: str) -> list[int]:
+    """Return the ids of a list such as "0-99,205"."""
+    ids: list[int] = []
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*(\d{1,9})(?:-(\d{1,9}))?\s*", part)
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+        if not first <= last < first + LARGEST:
+            raise ValueError(f"dictionary {name!r}: ids are listed like 0-99,205, got {part!r}")
+        ids += range(first, last + 1)
+    return ids
+
+
+def write_dictionary(dictionary: Dictionary, path: str | Path, side_m: float = 0.03) -> Path:
+    """Write a dictionary in the reference's JSON format and return its path.
+
+    Each id has its four oriented signatures and, for each, the world points of the image's top-left, top-right,
+    bottom-right and bottom-left corner: millimetres from the print's top-left corner, x right, y down, z 0.  The
+    reference gives 30.0 for a side and no unit.  Raises ValueError for a side that is no length.
+    """
+    if not (np.isfinite(side_m) and side_m > 0):
+        raise ValueError(f"side_m must be a positive length in metres, got {side_m}")
+    corners_mm = np.zeros((4, 3))
+    corners_mm[:, :2] = square(0.0, round(1e3 * side_m, 6))
+    entries = {
+        str(marker_id): {
+            name: {
+                "signature": "".join(map(str, dictionary.oriented[row, turns])),
+                "world_points": np.roll(corners_mm, turns, axis=0).tolist(),
+            }
+            for turns, name in enumerate(ORIENTATIONS)
+        }
+        for row, marker_id in enumerate(dictionary.ids)
+    }
+    path = Path(path)
+    path.write_text(json.dumps(entries, indent=2))
+    return path
