@@ -27,8 +27,10 @@ NOISE_FLOOR_PX = 0.03
 """No edge point is believed to be better than this."""
 CORRELATION_LENGTH_PX = 1.6
 """Edge points nearer than this along an edge share their noise (blur, JPEG blocks)."""
-CORNER_FLOOR_PX = 0.02
+CORNER_FLOOR_PX = 0.015
 """What a corner's standard deviation never falls below: print, lens model, neighbouring edges."""
+PULL_PX, PULL_FLOOR_PX = 0.03, 0.005
+"""How far a whole edge may be off when its neighbours are as near as ``SHARP_REACH_PX``, and at least."""
 TUKEY = 4.685
 """Residuals beyond this many standard deviations weigh nothing (95 % efficiency on Gaussian noise)."""
 REWEIGHTINGS = 4
@@ -46,7 +48,7 @@ class EdgeFit(Generic[W]):
     """A warp fitted to edges.
 
     ``covariance`` (P, P) is of the warp's own parameters, the bias marginalised.  ``weight`` (E, M) is each
-    point's final weight, 0 where it was not used; ``offset_px`` (E, M) its distance from ``before``, the
+    point's final weight in 1 / px^2, 0 where it was not used; ``offset_px`` (E, M) its distance from ``before``, the
     warp the edges were looked for with, the bias removed.  ``cost`` is the mean truncated squared residual
     over every point in view: what alternatives are compared by.  ``moved_px`` is how far the step moved the edge
     that moved most.
@@ -75,8 +77,8 @@ def fit_edges(
     if len(set((seen.edge[use.any(axis=1)] % 4).tolist())) < 4:  # edges come in fours: sides of a square
         return None
     template, normal, offset = EDGE_POINTS[seen.edge][use], seen.normal[use], seen.offset_px[use]
-    share = np.broadcast_to(_independent_share(seen)[:, None], use.shape)[use]
-    fitted, left, solution = _gauss_newton(warp, template, normal, offset, share)
+    share, common = (np.broadcast_to(part[:, None], use.shape)[use] for part in _trust(seen))
+    fitted, left, solution = _gauss_newton(warp, template, normal, offset, share, common)
     residual = left - solution.x[-1]
     weights, offsets = np.zeros(use.shape), np.zeros(use.shape)
     weights[use], offsets[use] = solution.weight, offset - solution.x[-1]
@@ -95,7 +97,9 @@ def fit_edges(
     )
 
 
-def _gauss_newton(warp: W, template: Array, normal: Array, offset: Array, share: Array) -> tuple[W, Array, _Solution]:
+def _gauss_newton(
+    warp: W, template: Array, normal: Array, offset: Array, share: Array, common: Array
+) -> tuple[W, Array, _Solution]:
     """Return the warp that brings template points (N, 2) to where they were measured, ``offset`` along ``normal``.
 
     Also what is left of the offsets, the bias included, and the last solution.  One step does where the warp is
@@ -106,7 +110,7 @@ def _gauss_newton(warp: W, template: Array, normal: Array, offset: Array, share:
     for _ in range(MAX_STEPS):
         by_warp = (normal[:, None, :] @ warp.jacobian(template))[:, 0]
         A = np.column_stack([by_warp, np.ones(len(by_warp))])
-        solution = _robust_least_squares(A, left, share, np.append(warp.step_sigma(), BIAS_SIGMA_PX))
+        solution = _robust_least_squares(A, left, share, common, np.append(warp.step_sigma(), BIAS_SIGMA_PX))
         expected = left - by_warp @ solution.x[:-1]
         warp = warp.stepped(solution.x[:-1])
         left = ((places_px - warp(template)) * normal).sum(axis=1)
@@ -116,7 +120,7 @@ def _gauss_newton(warp: W, template: Array, normal: Array, offset: Array, share:
 
 
 class _Solution(NamedTuple):
-    """Unknowns (P,), final weights (N,), standard deviation of one point, covariance (P, P)."""
+    """Unknowns (P,), final weights (N,) in 1 / px^2, standard deviation of one point, covariance (P, P)."""
 
     x: Array
     weight: Array
@@ -136,30 +140,32 @@ def _usable(seen: EdgePoints, sharp_only: bool) -> NDArray[np.bool_]:
     return seen.found & (mostly & (seen.reach_px >= LEAST_REACH_PX))[:, None]
 
 
-def _independent_share(seen: EdgePoints) -> Array:
-    """Return how much (E,) one point of an edge counts.
+def _trust(seen: EdgePoints) -> tuple[Array, Array]:
+    """Return how much (E,) one point of an edge counts, and the variance (E,) its whole edge may be off by, in points.
 
-    Points denser than the noise's own length share it; an edge that its neighbours pull counts little.
+    Points denser than the noise's own length share it.  An edge is pulled by its neighbours the more the nearer
+    they are; what all its points have in common does not average out, so each carries it as many times.
     """
     spacing = seen.length_px / POINTS_PER_EDGE
-    sharpness = np.minimum(1.0, seen.reach_px / SHARP_REACH_PX) ** 4
-    return np.minimum(1.0, spacing / CORRELATION_LENGTH_PX) * sharpness
+    pull_px = PULL_PX * (SHARP_REACH_PX / np.maximum(seen.reach_px, 1e-3)) ** 2 + PULL_FLOOR_PX
+    return np.minimum(1.0, spacing / CORRELATION_LENGTH_PX), POINTS_PER_EDGE * pull_px**2
 
 
-def _robust_least_squares(A: Array, offset: Array, share: Array, prior_sigma: Array) -> _Solution:
+def _robust_least_squares(A: Array, offset: Array, share: Array, common: Array, prior_sigma: Array) -> _Solution:
     """Solve A x = offset with Tukey's weights, each unknown known to be 0 within ``prior_sigma`` (P,) beforehand."""
     scale = np.sqrt((A * A).sum(axis=0)) + 1e-12  # metres and radians differ by orders: solve in units of pixels
     A = A / scale
     prior = np.diag((prior_sigma * scale) ** -2.0 + 1e-9)
-    weight = share
+    robust = np.ones(len(offset))
     sigma_px = max(_spread(offset - offset.mean()), 0.3)
     for _ in range(REWEIGHTINGS):
-        weighted = A.T * (weight / sigma_px**2)
+        weight = robust / (sigma_px**2 / share + common)
+        weighted = A.T * weight
         information = weighted @ A + prior
         x = np.linalg.solve(information, weighted @ offset)
         residual = offset - A @ x
         sigma_px = max(_spread(residual), NOISE_FLOOR_PX)
-        weight = share * np.maximum(1 - (residual / (TUKEY * sigma_px)) ** 2, 0) ** 2
+        robust = np.maximum(1 - (residual / (TUKEY * sigma_px)) ** 2, 0) ** 2
     return _Solution(x / scale, weight, sigma_px, np.linalg.inv(information) / np.outer(scale, scale))
 
 
@@ -193,7 +199,7 @@ def _layer_corners(fit: EdgeFit[W], black: tuple[float, float], rows: list[int])
     predicted, along, before = fit.before(np.stack([template, template + 0.02 * ahead, template - 0.02 * behind]))
     # row 0: the edge that ends at the corner, row 1: the one that starts there
     N = np.stack([_outward(predicted - before), _outward(along - predicted)], axis=1)
-    offsets, variances = _edge_lines(fit.offset_px[rows], fit.weight[rows], fit.sigma_px)
+    offsets, variances = _edge_lines(fit.offset_px[rows], fit.weight[rows])
     solve = np.linalg.inv(N)
     met = np.stack([np.roll(offsets[:, 1], 1), offsets[:, 0]], axis=1)
     uncertain = np.stack([np.roll(variances[:, 1], 1), variances[:, 0]], axis=1)
@@ -207,12 +213,12 @@ def _outward(tangent: Array) -> Array:
     return np.stack([tangent[:, 1], -tangent[:, 0]], axis=1) / np.linalg.norm(tangent, axis=1, keepdims=True)
 
 
-def _edge_lines(offset: Array, weight: Array, sigma_px: float) -> tuple[Array, Array]:
+def _edge_lines(offset: Array, weight: Array) -> tuple[Array, Array]:
     """Return the offsets (E, 2) of lines fitted along edges (E, M) at their starts and ends, and their variances."""
     information = np.einsum("em,mi,mj->eij", weight, _LINE, _LINE)
     covariance = np.linalg.inv(information)
     ends = covariance @ ((weight * offset) @ _LINE)[:, :, None]
-    return ends[:, :, 0], sigma_px**2 * np.diagonal(covariance, axis1=1, axis2=2)
+    return ends[:, :, 0], np.diagonal(covariance, axis1=1, axis2=2)
 
 
 _LINE = np.stack([1 - ALONG, ALONG], axis=1)

@@ -51,7 +51,8 @@ class Tracker:
     """Finds the markers of a detector in consecutive images of one camera.
 
     Each marker's edges are predicted from its last motion, refined and verified by its code; then looked for
-    nearby; then in the whole image, which is also searched now and then for markers that come into view.
+    nearby; then in the whole image, which is also searched now and then for markers that come into view, unless
+    all those that the detector was told of are there.
     The same images give the same detections.
     """
 
@@ -70,7 +71,7 @@ class Tracker:
         Raises ValueError as ``Detector.detect`` does.
         """
         found, before = self._follow_all(image, camera) if camera is not None and self._tracks else ([], {})
-        if not found or len(found) < len(self._tracks) or self._frames % SEARCH_EVERY == 0:
+        if not found or len(found) < len(self._tracks) or (self._frames % SEARCH_EVERY == 0 and not self._all(found)):
             found = surest(self.detector.find(self.detector.view(image, camera)), first=found)
         self._tracks = [
             Track(seen.marker_id, seen.T_cam_marker, before.get(id(seen)))
@@ -79,6 +80,11 @@ class Tracker:
         ]
         self._frames += 1
         return found
+
+    def _all(self, found: list[Detection]) -> bool:
+        """Return whether every marker the detector was told of is found."""
+        told = set(self.detector.markers)
+        return bool(told) and told <= {seen.marker_id for seen in found}
 
     def _follow_all(self, image: NDArray[np.uint8], camera: Camera) -> tuple[list[Detection], dict[int, Array]]:
         """Return the tracked markers still seen, and for each (by Python's id) its pose in the last frame."""
