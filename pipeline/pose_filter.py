@@ -67,6 +67,9 @@ class PoseFilter:
         self._t_ns: int | None = None
         self._t_measured_ns: int | None = None
         self._refused_frames = 0
+        """Frames in a row whose measurements were all refused."""
+        self._late_frames = 0
+        """Frames in a row stamped before the last one taken."""
 
     def step(self, message: AnyMessage) -> Iterable[AnyMessage]:
         """Take a calibration, or one frame's detections and return the state, its transforms and any events.
@@ -115,22 +118,27 @@ class PoseFilter:
     def _take_stamp(self, frame: Frame) -> bool:
         """Bring the filter to the frame's time; False when that is not after the last one's."""
         if self._t_ns is not None and frame.t_ns <= self._t_ns:
-            late_s = (self._t_ns - frame.t_ns) / NS_PER_S
-            if late_s == 0:
-                frame.rejections.append("stamp: the same as the last frame's")
-                frame.t_ns = self._t_ns
-                return False
-            self._refused_frames += 1
-            frame.rejections.append(f"stamp: {late_s:.6f} s before the last frame's")
-            if self._refused_frames < self._settings.reset_after_frames:
-                frame.t_ns = self._t_ns
-                return False
-            self._lose(frame, f"{self._refused_frames} frames in a row from before the last one: the clock went back")
-        elif self._bank is not None and self._t_ns is not None:
+            return self._refuse_stamp(frame, self._t_ns)
+        if self._bank is not None and self._t_ns is not None:
             self._lose_when_old(frame)
             if self._bank is not None:
                 self._bank.predict((frame.t_ns - self._t_ns) / NS_PER_S, self._age_s(frame.t_ns) or 0.0)
         self._t_ns = frame.t_ns
+        self._late_frames = 0
+        return True
+
+    def _refuse_stamp(self, frame: Frame, last_ns: int) -> bool:
+        """Refuse a frame that is not after the last one; True when so many came that the clock was set back."""
+        if frame.t_ns == last_ns:
+            frame.rejections.append("stamp: the same as the last frame's")
+            return False
+        self._late_frames += 1
+        frame.rejections.append(f"stamp: {(last_ns - frame.t_ns) / NS_PER_S:.6f} s before the last frame's")
+        if self._late_frames < self._settings.reset_after_frames:
+            frame.t_ns = last_ns
+            return False
+        self._lose(frame, f"{self._late_frames} frames in a row from before the last one: the clock was set back")
+        self._t_ns, self._late_frames = frame.t_ns, 0
         return True
 
     def _usable_layers(self, message: Detections, frame: Frame) -> list[tuple[Detection, list[SeenLayer]]]:
@@ -172,7 +180,6 @@ class PoseFilter:
 
     def _track(self, layers: list[SeenLayer], frame: Frame) -> None:
         """Update with the layers that pass the gate; start afresh when nothing has passed for too long."""
-        assert (self._bank is not None and self._eye is not None) or not layers
         if not layers or self._bank is None or self._eye is None:
             return
         distances = self._bank.gate(layers, self._eye)
