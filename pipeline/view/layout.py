@@ -52,7 +52,13 @@ PLOTS = (
     ("nis", "NIS per degree of freedom"),
     ("latency_ms", "Latency, frame to state [ms]"),
 )
-WITH_LEGEND = ("range_m", "seen", "position_error_mm", "nis")
+LEGENDS: dict[str, rrb.components.Corner2DLike] = {
+    "range_m": "RightTop",
+    "seen": "LeftTop",
+    "position_error_mm": "RightTop",
+    "nis": "RightTop",
+}
+"""In which corner a plot says what its lines are; the others have the same."""
 
 LEGEND = f"""\
 A **chaser** comes in to a **target** and measures where it is from the printed markers.
@@ -138,7 +144,9 @@ def blueprint(corridor: CorridorSection) -> rrb.Blueprint:
     )
     plots = [
         rrb.TimeSeriesView(
-            origin=f"plots/{name}", name=title, plot_legend=rrb.PlotLegend("RightTop", visible=name in WITH_LEGEND)
+            origin=f"plots/{name}",
+            name=title,
+            plot_legend=rrb.PlotLegend(LEGENDS.get(name), visible=name in LEGENDS),
         )
         for name, title in PLOTS
     ]

@@ -96,5 +96,5 @@ def _label_place(detection: Detection, width_px: int, height_px: int) -> tuple[f
     x, y = points_array(detection.corners_px).T
     return (
         float(np.clip(x.mean(), 0.2 * width_px, 0.8 * width_px)),
-        float(np.clip(y.min() - 0.06 * height_px, 0.05 * height_px, 0.95 * height_px)),
+        float(np.clip(y.min() - 0.075 * height_px, 0.05 * height_px, 0.95 * height_px)),
     )

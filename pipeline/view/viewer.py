@@ -219,18 +219,19 @@ class Viewer:
         self._last["chaser shown"] = True
         self._draw_chaser(layout.ESTIMATE, T_chaser_target, motion)
         self._draw_frustum(motion.range_m)
-        covariance = np.full((12, 12), np.nan) if state.covariance is None else np.reshape(state.covariance, (12, 12))
+        unknown = np.full((12, 12), np.nan)
+        covariance = unknown if state.covariance is None else np.reshape(state.covariance, (12, 12))
+        settled = SIGMAS * _sigma(motion.closing_by, covariance) < self._mission.filter.initial_speed_m_s
+        shown = covariance if settled else unknown  # bounds like the filter's first guess would flatten the plots
         for name, scale, value, by in motion.plotted():
-            bound = SIGMAS * np.sqrt(by @ covariance @ by)
-            if name == "closing_mm_s" and bound > self._mission.filter.initial_speed_m_s:
-                bound = np.nan  # no better than the filter's first guess: would flatten the plot and say nothing
+            bound = SIGMAS * _sigma(by, shown)
             low = value - bound if name == "closing_mm_s" else np.maximum(value - bound, 0.0)
             self._plot(f"{name}/estimate", scale * np.array([value, value + bound, low]))
-        if state.covariance is None:
-            return
-        position_m, attitude_rad = (SIGMAS * np.sqrt(np.trace(covariance[k : k + 3, k : k + 3])) for k in (0, 3))
+        position_m, attitude_rad = (SIGMAS * np.sqrt(np.trace(shown[k : k + 3, k : k + 3])) for k in (0, 3))
         self._plot("position_error_mm/bound", 1e3 * position_m)
         self._plot("attitude_error_deg/bound", np.rad2deg(attitude_rad))
+        if state.covariance is None:
+            return
         half_axes_m, xyzw = ellipsoid(motion.jacobian @ covariance @ motion.jacobian.T, SIGMAS * ELLIPSOID_SCALE)
         cloud = rr.Ellipsoids3D.from_fields(
             centers=[motion.p_port_m], half_sizes=[half_axes_m], quaternions=[rr.Quaternion(xyzw=xyzw)]
@@ -307,6 +308,11 @@ class Viewer:
             self._T_chaser_port,
             self._T_target_port,
         )
+
+
+def _sigma(by: Array, covariance: Array) -> float:
+    """Return the standard deviation of a quantity from its derivative (12,) by the state."""
+    return float(np.sqrt(by @ covariance @ by))
 
 
 @lru_cache
