@@ -1,0 +1,1 @@
+"""Benchmarks: anyone can run them; each says what it ran on."""
