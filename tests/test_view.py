@@ -209,6 +209,17 @@ def test_errors_and_bounds_are_the_runs(tmp_path: Path):
     np.testing.assert_allclose(bound_mm, 3 * np.sqrt(3), rtol=1e-6)
 
 
+def test_bounds_wait_until_the_filter_has_settled(tmp_path: Path):
+    """The first frame knows its speed no better than the filter's first guess: estimates are plotted, bounds not yet."""
+
+    def sigma(k: int) -> np.ndarray:
+        return np.full(12, 0.2 if k == 0 else 1e-3)
+
+    path = show(make_run(3, sigma=sigma), tmp_path / "run.rrd")
+    lines = np.array(list(scalars(path, "/plots/closing_mm_s/estimate").values()))
+    assert np.isfinite(lines).tolist() == [[True, False, False], [True] * 3, [True] * 3]
+
+
 def test_truth_may_come_before_or_after_its_state(tmp_path: Path):
     run = list(make_run(12, error=lambda k: ERROR))
     late = [item for item in run if item[0].topic is not TRUTH] + [item for item in run if item[0].topic is TRUTH]
