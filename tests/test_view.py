@@ -210,7 +210,7 @@ def test_errors_and_bounds_are_the_runs(tmp_path: Path):
 
 
 def test_bounds_wait_until_the_filter_has_settled(tmp_path: Path):
-    """The first frame knows its speed no better than the filter's first guess: estimates are plotted, bounds not yet."""
+    """While the speed is known no better than the first guess, estimates are plotted and bounds are not."""
 
     def sigma(k: int) -> np.ndarray:
         return np.full(12, 0.2 if k == 0 else 1e-3)
