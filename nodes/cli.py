@@ -12,6 +12,8 @@ from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 
+from nodes import ONE_THREAD
+
 EXIT_ERROR, EXIT_USAGE, EXIT_INTERRUPTED = 1, 2, 130
 DESCRIPTION = "Relative navigation for spacecraft rendezvous on AstraTag markers."
 EPILOG = """\
@@ -24,6 +26,7 @@ RELNAV_DEBUG=1 shows where an error comes from.
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return the exit code: 0 only when the job was done."""
     args = _parser().parse_args(arguments)
+    os.environ.update(ONE_THREAD)
     module, function = args.run.split(":")
     try:
         code = getattr(import_module(module), function)(args)

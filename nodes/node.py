@@ -56,7 +56,6 @@ def _run_source(args: argparse.Namespace, link: Link, stop: StopSignal) -> None:
     )
     source.on_warning = _warn
     options = _options(args, source.mission)
-    source.on_warning = _warn
     pace = Pace(speed=None if math.isinf(args.speed) else args.speed, loop=args.loop, resume=_resume(args.resume))
     with Bus(link, vehicle=source.mission.vehicle, node="source", lossless=options.lossless) as bus:
         SourceNode(source, pace, options, bus, stop).run()

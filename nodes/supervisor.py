@@ -18,6 +18,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from nodes import ONE_THREAD
 from nodes.bus import Bus, Credit, Link, Presence, Received
 from nodes.processes import Process
 from schemas import CodecError, RelativeState, Stamp
@@ -30,8 +31,6 @@ FINISH_PATIENCE_S = 15.0
 MOST_RESTARTS = 5
 RESTART_MEMORY_S = 30.0
 ERROR_PREFIX = "relnav: error: "
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
-"""Nodes are parallel by being processes."""
 NODES = (sys.executable, "-P", "-m", "nodes")
 """The command line of the very code that runs here, whatever lies in the user's folder."""
 ROOT = Path(__file__).resolve().parent.parent
