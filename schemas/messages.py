@@ -153,7 +153,7 @@ class RelativeState(Message):
     """Time of validity."""
     mode: Mode = number(2)
     T_chaser_target: Pose | None = number(3, default=None)
-    """Absent in INIT, like everything that depends on it."""
+    """Absent in INIT and LOST, like everything that depends on it."""
     v_chaser_target_m_s: Vector3 | None = number(4, default=None)
     """Velocity of the target's origin in chaser axes, as the chaser's body frame sees it."""
     omega_chaser_target_in_target_rad_s: Vector3 | None = number(5, default=None)
