@@ -188,7 +188,8 @@ class Family:
         """Return the upright cells (..., 48) of ids (...).  Raises ValueError for an id outside the family."""
         ids = np.asarray(ids)
         if ids.size and not (ids.min() >= 0 and ids.max() < len(self)):
-            raise ValueError(f"{self.name} has ids 0-{len(self) - 1}, got {ids.min()} to {ids.max()}")
+            outside = ids.min() if ids.min() < 0 else ids.max()
+            raise ValueError(f"{self.name} has ids 0-{len(self) - 1}, got {outside}")
         return unpack(self.encoder(self._upright[ids]))
 
     def identify(self, cells: NDArray[np.uint8]) -> tuple[int, int] | None:
