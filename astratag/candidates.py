@@ -26,6 +26,7 @@ HOPELESS = 0.4
 """Correlation after a coarse alignment below which a fine one is not tried."""
 SURE = 0.85
 """Correlation from which a reading needs no second opinion."""
+MAX_FAINT = 24
 MAX_BENT = 3
 LEAST_BENT_SIDE_PX = 24.0
 OUTER = square(0.0, TEMPLATE_UNITS)
@@ -51,13 +52,30 @@ def flat_candidates(gray: Image, quads: Array, codebook: Codebook) -> tuple[list
     """Return the quads (Q, 4, 2) that read something like a code, and those that do only faintly, the best first."""
     if len(quads) == 0:
         return [], []
-    warps = [HomographyWarp.from_points(OUTER, quad) for quad in quads]
-    cells = cell_values(gray, np.stack([warp(SAMPLES) for warp in warps]))
-    candidates = [_turned(reading, quad) for reading, quad in zip(codebook.read(cells), quads, strict=True)]
-    candidates.sort(key=lambda c: -c.reading.correlation)
-    promising = [c for c in candidates if c.reading.correlation >= PROMISING]
-    faint = [c for c in candidates if FAINT <= c.reading.correlation < PROMISING]
+    readings = codebook.read(cell_values(gray, _samples_in(quads)))
+    ranked = sorted(zip(readings, quads, strict=True), key=lambda pair: -pair[0].correlation)
+    promising = [_turned(*pair) for pair in ranked if pair[0].correlation >= PROMISING]
+    faint = [_turned(*pair) for pair in ranked[:MAX_FAINT] if FAINT <= pair[0].correlation < PROMISING]
     return promising[:MAX_CANDIDATES], faint
+
+
+def _samples_in(quads: Array) -> NDArray[np.float32]:
+    """Return where the cells' sampling points lie (Q, S, 2) when each quad (Q, 4, 2) is the outer square.
+
+    The projective map of the unit square onto four points in closed form: Heckbert, "Fundamentals of texture
+    mapping and image warping", 1989.
+    """
+    p0, p1, p2, p3 = (quads[:, corner] for corner in range(4))
+    d1, d2, total = p1 - p2, p3 - p2, p0 - p1 + p2 - p3
+    area = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
+    area = np.where(np.abs(area) > 1e-9, area, np.inf)
+    g = ((total[:, 0] * d2[:, 1] - total[:, 1] * d2[:, 0]) / area)[:, None]
+    h = ((d1[:, 0] * total[:, 1] - d1[:, 1] * total[:, 0]) / area)[:, None]
+    across, down = p1 - p0 + g * p1, p3 - p0 + h * p3
+    rows = np.stack([np.column_stack([across, g]), np.column_stack([down, h]), np.insert(p0, 2, 1.0, axis=1)], axis=2)
+    u, v = (SAMPLES / TEMPLATE_UNITS).T.astype(np.float32)
+    x, y, depth = (a * u + b * v + c for a, b, c in rows.astype(np.float32).transpose(1, 2, 0)[..., None])
+    return np.stack([x, y], axis=2) / np.maximum(depth, np.float32(1e-6))[:, :, None]
 
 
 def _turned(reading: Reading, quad: Array) -> Candidate:

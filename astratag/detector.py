@@ -37,7 +37,7 @@ HALVE_FROM_PX = 500_000
 """Images with more pixels than this are searched at half resolution first."""
 LEAST_LIKENESS = 0.45
 """Correlation of the whole print with what is seen through a fit, below which it is something else."""
-CERTAIN_LIKENESS = 0.85
+CERTAIN_LIKENESS = 0.75
 """Likeness from which no other layer is tried."""
 AMBIGUOUS_RATIO, AMBIGUOUS_RMS_PX = 4.0, 0.05
 """Both planar poses are tried when the worse fits the corners within this factor of the better, or of this residual."""

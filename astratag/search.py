@@ -5,7 +5,7 @@ Pixels: (0, 0) is the centre of the top-left pixel.  Quads run clockwise in the 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain
 
 import cv2
@@ -24,7 +24,9 @@ POLYGON_TOLERANCES = (0.03, 0.05, 0.015, 0.08)
 
 MIN_PERIMETER_PX = 24.0
 MIN_SIDE_PX = 3.0
-MAX_CONTOURS = 300
+LEAST_ROUNDNESS = 0.014
+"""Area over squared perimeter: 0.0625 of a square, 0.03 of one seen at 80 degrees, less of ragged shapes."""
+MAX_CONTOURS = 200
 MAX_QUADS = 160
 OUTSET_PX = 0.75
 LEAST_SINE = 0.1
@@ -47,12 +49,21 @@ def find_quads(gray: Image, *, halve: bool = False) -> Array:
         THRESHOLD_OFFSET,
     )
     contours, _ = cv2.findContours(ink, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
-    outlines = (contour for contour in contours if len(contour) >= 4 and cv2.contourArea(contour, True) < 0)
-    measured = ((cv2.arcLength(outline, True), outline) for outline in outlines)
-    long_enough = sorted((m for m in measured if m[0] >= MIN_PERIMETER_PX), key=lambda m: -m[0])[:MAX_CONTOURS]
-    quads = list(chain.from_iterable(_quads_of(contour, perimeter) for perimeter, contour in long_enough))
+    outlines = sorted(_plausible(contours), key=lambda outline: -outline[0])[:MAX_CONTOURS]
+    quads = list(chain.from_iterable(_quads_of(contour, perimeter) for perimeter, contour in outlines))
     found = _grown(np.array(quads[:MAX_QUADS], dtype=float).reshape(-1, 4, 2))
     return 2.0 * found + 0.5 if halve else found
+
+
+def _plausible(contours: Sequence[NDArray[np.int32]]) -> Iterator[tuple[float, NDArray[np.int32]]]:
+    """Yield perimeter and contour of those that run around ink, are long enough, and not too ragged for a square."""
+    for contour in contours:
+        if len(contour) >= 4:
+            area = -cv2.contourArea(contour, True)  # negative around ink, positive around holes in it
+            if area >= MIN_SIDE_PX**2:
+                perimeter = cv2.arcLength(contour, True)
+                if perimeter >= MIN_PERIMETER_PX and area >= LEAST_ROUNDNESS * perimeter**2:
+                    yield perimeter, contour
 
 
 def _grown(quads: Array) -> Array:

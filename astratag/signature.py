@@ -84,7 +84,7 @@ class Codebook:
         """Return the best reading of each row of cells (Q, 48)."""
         if len(cells) == 0:
             return []
-        correlations = unit(cells) @ self._unit_codes.T
+        correlations = np.einsum("qc,kc->qk", unit(cells), self._unit_codes)
         best = correlations.argmax(axis=1)
         wrong = hamming(cells, self.dictionary.oriented.reshape(-1, CELLS)[best])
         return [
@@ -114,20 +114,21 @@ def hamming(cells: Array, codes: NDArray[np.uint8]) -> NDArray[np.int64]:
     return ((cells > ((white + black) / 2)[:, None]) != (codes == 1)).sum(axis=1)
 
 
-def sample(gray: Image, points_px: Array) -> Array:
+def sample(gray: Image, points_px: Array | NDArray[np.float32]) -> Array:
     """Return gray values at pixels (N, M, 2), interpolated; 0 outside the image."""
-    points = np.clip(points_px, -1e4, 1e4).astype(np.float32)
+    points = np.clip(points_px.astype(np.float32, copy=False), -1e4, 1e4)
     flat = points.reshape(-1, 1, 2)
     if len(flat) < 32_000:
         return cv2.remap(gray, flat, None, cv2.INTER_LINEAR).reshape(points.shape[:-1]).astype(float)
     return cv2.remap(gray, points, None, cv2.INTER_LINEAR).astype(float)
 
 
-def cell_values(gray: Image, samples_px: Array) -> Array:
+def cell_values(gray: Image, samples_px: Array | NDArray[np.float32]) -> Array:
     """Return the 48 cell means (Q, 48), black level removed, of patterns sampled at ``SAMPLES`` (Q, S, 2)."""
     values = sample(gray, samples_px)
     cells = values[:, : CELL_SAMPLES.shape[0] * CELL_SAMPLES.shape[1]].reshape(len(values), CELLS, -1).mean(axis=2)
-    return cells - values[:, -len(ALWAYS_BLACK) :] @ _ILLUMINATION.T
+    # einsum, not @: products of this size wake BLAS threads that cost more than they save
+    return cells - np.einsum("qb,cb->qc", values[:, -len(ALWAYS_BLACK) :], _ILLUMINATION)
 
 
 def layer_cells(gray: Image, warp: Warp, layer: int) -> Array:
