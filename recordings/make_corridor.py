@@ -36,7 +36,7 @@ START_NS = 1_783_814_400 * NS_PER_S  # 2026-07-12T00:00:00Z
 FRAME_RATE_HZ = 15.0
 EXPOSURE_S = 0.006
 RAYS = 5
-JPEG_QUALITY = 85
+JPEG_QUALITY = 83
 PROCESSES = 2
 
 CAMERA = Camera(
@@ -45,7 +45,7 @@ CAMERA = Camera(
     width=1280,
     height=720,
 )
-APPROACH = Approach(duration_s=24.0)
+APPROACH = Approach(duration_s=22.0)
 MARKER_ID, SIDE_M = 7, 0.1
 LOOKING_FORWARD = PoseSection(translation_m=(0.25, 0.0, 0.0), rotation_wxyz=(0.5, 0.5, 0.5, 0.5))
 """The camera in the middle of the chaser's port; its z along the chaser's x, its x to the chaser's y."""
