@@ -29,7 +29,7 @@ CORRELATION_LENGTH_PX = 1.6
 """Edge points nearer than this along an edge share their noise (blur, JPEG blocks)."""
 CORNER_FLOOR_PX = 0.015
 """What a corner's standard deviation never falls below: print, lens model, neighbouring edges."""
-PULL_PX, PULL_FLOOR_PX = 0.03, 0.005
+PULL_PX, PULL_FLOOR_PX = 0.023, 0.005
 """How far a whole edge may be off when its neighbours are as near as ``SHARP_REACH_PX``, and at least."""
 TUKEY = 4.685
 """Residuals beyond this many standard deviations weigh nothing (95 % efficiency on Gaussian noise)."""

@@ -45,7 +45,7 @@ def test_an_approach_is_followed_frame_by_frame(images: list[np.ndarray]) -> Non
         nees.append(error @ np.linalg.solve(seen.covariance, error) / 6)
     assert methods[0] == "cylinder"
     assert methods.count("tracked") >= FRAMES - 2
-    assert 0.3 < np.mean(nees) < 3.0
+    assert 0.15 < np.mean(nees) < 2.0  # no JPEG here: the uncertainty allows for it
 
 
 def test_a_marker_lost_and_moved_is_found_again(images: list[np.ndarray]) -> None:
