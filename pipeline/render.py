@@ -1,7 +1,8 @@
 """The simulated camera: rays cast through a calibrated lens at printed markers, in linear light.
 
 Everything is anti-aliased by area before it is encoded, so an edge in the linear picture stands where
-``Camera.project`` puts it (tested to 0.03 px at worst, 0.005 px on average).  Pixels: (0, 0) is the centre of the top-left pixel.
+``Camera.project`` puts it (tested to 0.03 px at worst, 0.005 px on average).  Pixels: (0, 0) is the
+centre of the top-left pixel.
 """
 
 from __future__ import annotations
