@@ -184,8 +184,9 @@ def _print_header(console: Console, subject: Subject, args: argparse.Namespace, 
     if view == "native":
         console.print("Rerun's window opens beside this")
     elif view == "web":
-        data = f"rerun%2Bhttp%3A%2F%2Flocalhost%3A{args.grpc_port}%2Fproxy"
-        console.print(f"watch it at http://localhost:{args.web_port}/?url={data}")
+        from pipeline.view import web_url
+
+        console.print(f"watch it at {web_url(args.web_port, args.grpc_port)}", markup=False)
     for warning in subject.warnings:
         console.print(f"warning: {warning}", style="yellow", markup=False)
 
