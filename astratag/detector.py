@@ -91,6 +91,7 @@ class Detector:
             if not (np.isfinite(spec.side_m) and spec.side_m > 0):
                 raise ValueError(f"markers[{marker_id}].side_m must be a positive length in metres, got {spec.side_m}")
         self._light_of = inverse_transfer(transfer)
+        self._light = np.zeros((0, 0), dtype=np.float32)
         self._codebook = Codebook(self.dictionary)
         self._artwork = Artwork(self.dictionary)
 
@@ -117,18 +118,19 @@ class Detector:
     ) -> View:
         """Return an image made ready: all of it, or only ``boxes`` ((2, 2) pixels: low and high x, y) of its light.
 
+        The light is kept in one buffer, which the next call overwrites: fresh memory costs more than the table.
         Raises ValueError as ``detect`` does.
         """
         gray = as_gray(image)
         if camera is not None:
             camera.require_size(gray.shape[1], gray.shape[0])
-        if boxes is None:
-            return View(gray, cv2.LUT(gray, self._light_of), camera)
-        light = np.zeros(gray.shape, dtype=np.float32)
-        for (left, top), (right, bottom) in boxes:
+        if self._light.shape != gray.shape:
+            self._light = np.zeros(gray.shape, dtype=np.float32)
+        whole = np.array([(0, 0), gray.shape[::-1]])
+        for (left, top), (right, bottom) in [whole] if boxes is None else boxes:
             part = slice(int(top), int(bottom)), slice(int(left), int(right))
-            light[part] = cv2.LUT(gray[part], self._light_of)
-        return View(gray, light, camera)
+            cv2.LUT(gray[part], self._light_of, dst=self._light[part])
+        return View(gray, self._light, camera)
 
     def spec(self, marker_id: int) -> MarkerSpec:
         """Return how a marker was made."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,7 @@ class Track:
     T_cam_marker: Array
     T_cam_marker_before: Array | None
 
+    @cached_property
     def predictions(self) -> list[Array]:
         """Return where the marker may be now: moved on as it moved last, or where it was."""
         if self.T_cam_marker_before is None:
@@ -103,7 +105,7 @@ class Tracker:
         """Return the part of the image (2, 2) a tracked marker should be in, low and high x, y; None when out of it."""
         spec = self.detector.spec(track.marker_id)
         surface = spec.surface or Flat()
-        around = np.concatenate([PoseWarp(camera, spec.side_m, surface, T)(OUTER) for T in track.predictions()])
+        around = np.concatenate([PoseWarp(camera, spec.side_m, surface, T)(OUTER) for T in track.predictions])
         margin = LOCAL_MARGIN * (around.max(axis=0) - around.min(axis=0))
         box = np.stack([around.min(axis=0) - margin, around.max(axis=0) + margin])
         box = np.clip(box, 0, (camera.width, camera.height)).astype(int)
@@ -111,7 +113,7 @@ class Tracker:
 
     def _follow(self, view: View, track: Track, box: NDArray[np.int64]) -> Detection | None:
         """Return a tracked marker where it is predicted, or near there; None when it is lost."""
-        for T_cam_marker in track.predictions():
+        for T_cam_marker in track.predictions:
             fit = self._fit_near(view, track.marker_id, T_cam_marker)
             if fit is not None and fit.cost < COST_LIMIT:
                 detection = self.detector.describe(view, track.marker_id, fit, "tracked")
