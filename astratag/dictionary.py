@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from astratag.codes.algebraic import Rejected
 from astratag.codes.families import FAMILIES
-from astratag.codes.family import REGION_CELLS, Family
-from astratag.codes.soft import Reading, decide, kept_cells
+from astratag.codes.family import Family
+from astratag.codes.soft import Reading, Search, decide, kept_cells
 from astratag.codes.words import pack
 from astratag.geometry import CELLS, square, turn_clockwise
 
@@ -127,23 +127,23 @@ class Dictionary:
         return Dictionary(self.family, chosen, self.signatures[[self.row(i) for i in chosen]])
 
     def decode(
-        self, cells: NDArray[np.float64], erased: ArrayLike | None = None, *, threshold: float | None = None
+        self,
+        cells: NDArray[np.float64],
+        erased: ArrayLike | None = None,
+        *,
+        threshold: float | None = None,
+        most_missing: int = 0,
     ) -> Reading | Rejected:
         """Return the reading that correlates best with brightnesses (48,), of all there are: maximum likelihood.
 
-        ``erased`` (8,) booleans name regions that do not count, TL, TR, BR, BL, L, T, R, B of the image.
-        ``threshold`` is the least correlation to accept, by default the one that chance passes once in a million
-        candidates.  Raises ValueError for cells or flags of another shape, or cells that are not finite.
+        Regions are those of the image: TL, TR, BR, BL, L, T, R, B.  ``erased`` (8,) booleans name some that do not
+        count; up to ``most_missing`` more may be left out where the others then fit far better.  ``threshold`` is
+        the least correlation to accept, by default the one that chance passes once in a million candidates.
+        Raises ValueError for cells or flags of another shape, or cells that are not finite.
         """
-        kept = kept_cells(cells, erased, REGION_CELLS)
-        return decide(
-            cells,
-            kept,
-            self._codes,
-            lambda n: (self.ids[n // 4], n % 4),
-            readings=self._words.size,
-            threshold=threshold,
-        )
+        search = Search(self._words.size, threshold, most_missing)
+        kept = kept_cells(cells, erased)
+        return decide(cells, kept, self._codes, lambda n: (self.ids[n // 4], n % 4), search)
 
 
 def _published() -> Dictionary:

@@ -13,7 +13,7 @@ and with 4000.  Where textures might be worse, ``effective_cells`` says how many
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 from scipy.special import betainc, betaincinv
 from scipy.stats import binom
@@ -26,15 +26,16 @@ TAIL = 100
 """Candidates that a measured tail must hold: it is then known to a tenth."""
 
 
-def chance_of_correlation(threshold: float, cells: float = CELLS) -> float:
+def chance_of_correlation(threshold: ArrayLike, cells: ArrayLike = CELLS) -> NDArray[np.float64]:
     """Return the chance that ``cells`` independent normal values correlate with a given code above a threshold.
 
-    With the mean removed the values point anywhere in ``cells - 1`` dimensions alike, so that
+    Both broadcast.  With the mean removed the values point anywhere in ``cells - 1`` dimensions alike, so that
     r^2 ~ Beta(1/2, cells/2 - 1), which is Student's t = r sqrt((cells - 2) / (1 - r^2)) with cells - 2 degrees
     of freedom: R. A. Fisher, "Frequency distribution of the values of the correlation coefficient", 1915.
     """
-    tail = betainc(cells / 2 - 1, 0.5, 1.0 - threshold**2) / 2
-    return float(tail if threshold >= 0 else 1.0 - tail)
+    threshold = np.asarray(threshold)
+    tail = betainc(np.asarray(cells) / 2 - 1, 0.5, 1.0 - threshold**2) / 2
+    return np.where(threshold >= 0, tail, 1.0 - tail)
 
 
 def acceptance_threshold(

@@ -27,27 +27,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from astratag.codes import gf64
 from astratag.codes.algebraic import Rejected, decode_symbols
-from astratag.codes.soft import Reading, decide, kept_cells, likely_words, split_level
-from astratag.codes.words import LinearMap, Words, pack, unpack
+from astratag.codes.soft import Reading, Search, decide, kept_cells, likely_words, split_level
+from astratag.codes.words import CELLS_PER_REGION, REGION_CELLS, LinearMap, Words, pack, unpack
 from astratag.geometry import CELLS, REGIONS, TURN_CLOCKWISE
 
-CELLS_PER_REGION = CELLS // REGIONS
 CHUNK = 1 << 20
-
-
-def _region_cells() -> NDArray[np.int64]:
-    """Return the cells (8, 6) of each region, cell j of one the image of cell j of the one before under the turn."""
-    rows = []
-    for first in (0, CELLS // 2):
-        row = np.arange(first, first + CELLS_PER_REGION)
-        for _ in range(REGIONS // 2):
-            rows.append(row)
-            row = TURN_CLOCKWISE[row]
-    return np.array(rows)
-
-
-REGION_CELLS = _region_cells()
-"""Cells (8, 6) of the regions TL, TR, BR, BL, L, T, R, B in the order in which they carry a symbol's bits."""
 
 
 @dataclass(frozen=True)
@@ -222,16 +206,20 @@ class Family:
         return Codeword(*identity, tuple(wrong.tolist()))
 
     def decode(
-        self, cells: NDArray[np.float64], erased: ArrayLike | None = None, *, threshold: float | None = None
+        self,
+        cells: NDArray[np.float64],
+        erased: ArrayLike | None = None,
+        *,
+        threshold: float | None = None,
+        most_missing: int = 0,
     ) -> Reading | Rejected:
         """Return the marker whose code correlates best with brightnesses (48,), searched among all identities.
 
-        ``erased`` (8,) booleans name regions that do not count, TL, TR, BR, BL, L, T, R, B of the image; at most
-        8 - k.  ``threshold`` is the least correlation to accept, by default the one that chance passes once in a
-        million candidates.  Candidates are the codewords through every choice of k regions, which holds the right
-        one whenever k regions read well, and those near the surest cells (``likely_words``).
+        Arguments and errors are those of ``Dictionary.decode``; at least k regions must be left.  Candidates are
+        the codewords through every choice of k regions, which hold the right one whenever k regions read well,
+        and those near the surest cells (``likely_words``).
         """
-        kept = kept_cells(cells, erased, REGION_CELLS)
+        kept = kept_cells(cells, erased)
         choices, words = self._any_k_regions
         whole = np.all(kept[REGION_CELLS], axis=1)
         if whole.sum() < self.k:
@@ -242,4 +230,5 @@ class Family:
         through = np.bitwise_xor.reduce(np.where(white.reshape(-1, self.message_bits), words[in_view], 0), axis=1)
         found = np.unique(np.concatenate([through, likely_words(cells, kept, level, self.generator)]))
         codes = unpack(found)
-        return decide(cells, kept, codes, lambda n: self.identify(codes[n]), 4 * len(self), threshold)
+        search = Search(4 * len(self), threshold, min(most_missing, REGIONS - self.k))
+        return decide(cells, kept, codes.astype(float), lambda n: self.identify(codes[n]), search)

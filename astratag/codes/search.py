@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from astratag.codes import gf64
-from astratag.codes.family import CELLS_PER_REGION, Family
-from astratag.codes.words import span
+from astratag.codes.family import Family
+from astratag.codes.words import CELLS_PER_REGION, span
 
 WANTED_DISTANCE = {2: 16, 3: 12, 4: 9}
 

@@ -13,9 +13,9 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from astratag.codes.acceptance import acceptance_threshold
+from astratag.codes.acceptance import acceptance_threshold, chance_of_correlation
 from astratag.codes.algebraic import Rejected
-from astratag.codes.words import Words
+from astratag.codes.words import REGION_CELLS, Words
 from astratag.geometry import CELLS, REGIONS
 
 Array = NDArray[np.float64]
@@ -36,10 +36,12 @@ class Reading:
     quarter_turns: int
     correlation: float
     hamming: int
+    missing: tuple[int, ...] = ()
+    """Regions of the image that were left out because the rest fits far better without them."""
 
 
-def kept_cells(cells: Array, erased: ArrayLike | None, regions: NDArray[np.int64]) -> Kept:
-    """Return which cells (48,) count when the cells of some ``regions`` (8, 6) are ``erased`` (8,).
+def kept_cells(cells: Array, erased: ArrayLike | None) -> Kept:
+    """Return which cells (48,) count when some regions are ``erased`` (8,).
 
     Raises ValueError when ``cells`` or ``erased`` are not what ``decode`` takes.
     """
@@ -50,23 +52,34 @@ def kept_cells(cells: Array, erased: ArrayLike | None, regions: NDArray[np.int64
         flags = np.asarray(erased)
         if flags.shape != (REGIONS,) or flags.dtype != bool:
             raise ValueError(f"erased must be {REGIONS} booleans, one a region, got {flags.dtype} {flags.shape}")
-        kept[regions[flags]] = False
+        kept[REGION_CELLS[flags]] = False
     return kept
 
 
 def correlations(cells: Array, kept: Kept, codes: NDArray) -> Array:
-    """Return the correlation (N,) of cells (48,) with codes (N, 48) of ones and zeros over the kept cells.
+    """Return the correlation (S, N) of cells (48,) with codes (N, 48) of ones and zeros over S sets (S, 48) of cells.
 
     Zero where the cells or a code show no contrast there.
     """
-    n = kept.sum()
-    centred = np.where(kept, cells - cells[kept].mean(), 0.0)
-    length = np.linalg.norm(centred)
-    ones = codes @ kept.astype(float)
+    n = kept.sum(axis=1, keepdims=True)
+    centred = np.where(kept, cells - (kept * cells).sum(axis=1, keepdims=True) / n, 0.0)
+    length = np.linalg.norm(centred, axis=1, keepdims=True)
+    unit = centred / np.where(length > LEAST_CONTRAST * np.abs(cells).max(), length, np.inf)
+    ones = kept.astype(float) @ codes.T
     spread = np.sqrt(ones * (n - ones) / n)  # length of a code with its mean removed
-    if length <= LEAST_CONTRAST * np.abs(cells).max():
-        return np.zeros(len(codes))
-    return (codes @ centred) / np.where(spread > 0, spread * length, np.inf)
+    return (unit @ codes.T) / np.where(spread > 0, spread, np.inf)
+
+
+def with_regions_missing(kept: Kept, most_missing: int) -> tuple[list[tuple[int, ...]], Kept]:
+    """Return the choices of up to so many of the whole regions left, and the cells (S, 48) that each leaves."""
+    if not 0 <= most_missing < REGIONS:
+        raise ValueError(f"most_missing is a number of regions, 0 to {REGIONS - 1}, got {most_missing}")
+    whole = np.flatnonzero(kept[REGION_CELLS].all(axis=1)).tolist()
+    choices = [c for m in range(min(most_missing, len(whole) - 1) + 1) for c in combinations(whole, m)]
+    left = np.repeat(kept[None], len(choices), axis=0)
+    for row, choice in enumerate(choices):
+        left[row, REGION_CELLS[list(choice)]] = False
+    return choices, left
 
 
 def hamming(cells: Array, kept: Kept, code: Bits) -> int:
@@ -76,34 +89,46 @@ def hamming(cells: Array, kept: Kept, code: Bits) -> int:
     return int((kept & ((cells > middle) != (code == 1))).sum())
 
 
-def decide(
-    cells: Array,
-    kept: Kept,
-    codes: NDArray,
-    identify: Callable[[int], tuple[int, int] | None],
-    readings: int,
-    threshold: float | None,
-) -> Reading | Rejected:
-    """Return the reading among ``codes`` (N, 48) that correlates best, or why none is good enough.
+@dataclass(frozen=True)
+class Search:
+    """What ``decide`` is to find: one of so many ``readings``, and what the caller of ``decode`` asked for."""
 
-    ``identify`` says whose code n is and how it is turned.  ``readings`` is how many there are in all, from which
-    ``threshold``, unless given, follows at the usual false-accept rate.
+    readings: int
+    threshold: float | None
+    most_missing: int
+
+
+def decide(
+    cells: Array, kept: Kept, codes: NDArray, identify: Callable[[int], tuple[int, int] | None], search: Search
+) -> Reading | Rejected:
+    """Return the reading among ``codes`` (N, 48) that chance explains least, or why none is good enough.
+
+    ``identify`` says whose code n is and how it is turned.  With regions that may be missing every choice of them
+    is tried and counts as one more comparison; all choices that are accepted must agree.
     """
-    if threshold is None:
-        threshold = acceptance_threshold(readings, cells=int(kept.sum()))
-    scores = correlations(cells, kept, codes)
-    best = int(scores.argmax())
-    score = float(scores[best])
-    if score <= 0.0:
+    if not kept.any():
+        return Rejected("no region is left")
+    choices, left = with_regions_missing(kept, search.most_missing)
+    count = left.sum(axis=1)
+    scores = correlations(cells, left, codes)
+    best = scores.argmax(axis=1)
+    score = scores.max(axis=1)
+    floor = {n: acceptance_threshold(search.readings, len(choices), cells=n) for n in set(count.tolist())}
+    needed = np.array([floor[n] if search.threshold is None else search.threshold for n in count.tolist()])
+    accepted = (score >= needed) & (score > 0)
+    surest = int(np.where(accepted, chance_of_correlation(score, np.maximum(count, 3)), np.inf).argmin())
+    if not (score > 0).any():
         return Rejected("the cells show no contrast")
-    if score < threshold:
-        return Rejected(f"the best correlation is {score:.3f}, below {threshold:.3f}")
-    if (scores > score - SAME_FIT).sum() > 1:
+    if not accepted.any():
+        return Rejected(f"the best correlation is {score[0]:.3f}, below {needed[0]:.3f}")
+    if len(np.unique(best[accepted])) > 1 or (scores[surest] > score[surest] - SAME_FIT).sum() > 1:
         return Rejected("two readings fit alike in the regions in view")
-    identity = identify(best)
+    code = int(best[surest])
+    identity = identify(code)
     if identity is None:
         return Rejected("the best codeword looks the same after half a turn and is nobody's")
-    return Reading(*identity, score, hamming(cells, kept, codes[best].astype(np.uint8)))
+    wrong = hamming(cells, left[surest], codes[code].astype(np.uint8))
+    return Reading(*identity, float(score[surest]), wrong, choices[surest])
 
 
 def split_level(values: Array) -> float:

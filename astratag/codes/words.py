@@ -1,4 +1,4 @@
-"""Codes as 48-bit words: cells packed into one integer each, and GF(2)-linear maps of them by table."""
+"""Cells as regions and as 48-bit words: their order under turns, packing, and GF(2)-linear maps by table."""
 
 from __future__ import annotations
 
@@ -7,9 +7,25 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from astratag.geometry import CELLS
+from astratag.geometry import CELLS, REGIONS, TURN_CLOCKWISE
 
 Words = NDArray[np.uint64]
+CELLS_PER_REGION = CELLS // REGIONS
+
+
+def _region_cells() -> NDArray[np.int64]:
+    """Return the cells (8, 6) of each region, cell j of one the image of cell j of the one before under the turn."""
+    rows = []
+    for first in (0, CELLS // 2):
+        row = np.arange(first, first + CELLS_PER_REGION)
+        for _ in range(REGIONS // 2):
+            rows.append(row)
+            row = TURN_CLOCKWISE[row]
+    return np.array(rows)
+
+
+REGION_CELLS = _region_cells()
+"""Cells (8, 6) of the regions TL, TR, BR, BL, L, T, R, B in the order in which they carry a symbol's bits."""
 
 
 def pack(cells: NDArray[np.uint8]) -> Words:
