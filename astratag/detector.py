@@ -47,6 +47,10 @@ NOTICEABLE_BEND = 0.02
 GRID_LINES = 9
 
 
+SQUARES = np.array([square(*layer.black) for layer in LAYERS])
+"""The black squares' corners (3, 4, 2), template units."""
+
+
 @dataclass(frozen=True)
 class MarkerSpec:
     """How one marker was made: side of its outer black square in metres, and the surface it is on (None: unknown)."""
@@ -258,8 +262,7 @@ class Detector:
         """
         height, width = view.gray.shape
         best: Reading | None = None
-        for layer in LAYERS:
-            corners = warp(square(*layer.black))
+        for layer, corners in zip(LAYERS, warp(SQUARES), strict=True):
             if (corners >= 0).all() and (corners <= (width - 1, height - 1)).all():
                 reading = self._codebook.read_as(layer_cells(view.gray, warp, layer.index), marker_id)
                 best = reading if best is None or reading.correlation > best.correlation else best
@@ -295,8 +298,8 @@ def warp_grid(warp: FittedWarp) -> Array:
 
 def _corner_rms(warp: PoseWarp, layers: Sequence[LayerDetection]) -> float:
     """Return the root mean square distance in pixels of the measured corners from where the pose puts them."""
-    errors = np.concatenate([warp(square(*LAYERS[seen.layer].black)) - seen.corners_px for seen in layers])
-    return float(np.sqrt((errors**2).sum(axis=1).mean()))
+    errors = warp(SQUARES[[seen.layer for seen in layers]]) - np.stack([seen.corners_px for seen in layers])
+    return float(np.sqrt((errors**2).sum(axis=-1).mean()))
 
 
 def surest(found: Sequence[Detection], first: Sequence[Detection] = ()) -> list[Detection]:

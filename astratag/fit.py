@@ -181,25 +181,36 @@ def measure_layers(fit: EdgeFit[W], shape: tuple[int, int]) -> tuple[LayerDetect
     Each edge is its predicted curve moved by an offset and a tilt of its own; corners are where neighbours meet.
     """
     layers = []
+    height, width = shape
+    around_px = fit.before(_CORNER_PROBES)
     for layer in LAYERS:
         rows = [i for i, e in enumerate(fit.points.edge) if EDGES[e].layer == layer.index and not EDGES[e].frame]
         if len(rows) == 4 and (fit.weight[rows] > 0).sum(axis=1).min() >= LEAST_FOUND * POINTS_PER_EDGE:
-            corners, sigma_px = _layer_corners(fit, layer.black, rows)
-            height, width = shape
+            corners, sigma_px = _layer_corners(around_px[layer.index], fit.offset_px[rows], fit.weight[rows])
             if (corners >= 0).all() and (corners <= (width - 1, height - 1)).all():
                 layers.append(LayerDetection(layer.index, corners, sigma_px))
     return tuple(layers)
 
 
-def _layer_corners(fit: EdgeFit[W], black: tuple[float, float], rows: list[int]) -> tuple[Array, float]:
-    """Return the corners (4, 2) of a square whose edges are ``rows`` of the fit, and their standard deviation."""
-    template = square(*black)
-    ahead = np.roll(template, -1, axis=0) - template
-    behind = np.roll(ahead, 1, axis=0)
-    predicted, along, before = fit.before(np.stack([template, template + 0.02 * ahead, template - 0.02 * behind]))
+def _corner_probes() -> Array:
+    """Return, for each layer, its corners and a point a little before and after each on the outline (3, 3, 4, 2)."""
+    corners = np.array([square(*layer.black) for layer in LAYERS])
+    ahead = 0.02 * (np.roll(corners, -1, axis=1) - corners)
+    return np.stack([corners, corners - np.roll(ahead, 1, axis=1), corners + ahead], axis=1)
+
+
+_CORNER_PROBES = _corner_probes()
+
+
+def _layer_corners(around_px: Array, offset: Array, weight: Array) -> tuple[Array, float]:
+    """Return the corners (4, 2) of a square and their standard deviation from the offsets (4, M) of its edges.
+
+    ``around_px`` (3, 4, 2) is where the corners are predicted, and the outline a little before and after each.
+    """
+    predicted, before, after = around_px
     # row 0: the edge that ends at the corner, row 1: the one that starts there
-    N = np.stack([_outward(predicted - before), _outward(along - predicted)], axis=1)
-    offsets, variances = _edge_lines(fit.offset_px[rows], fit.weight[rows])
+    N = np.stack([_outward(predicted - before), _outward(after - predicted)], axis=1)
+    offsets, variances = _edge_lines(offset, weight)
     solve = np.linalg.inv(N)
     met = np.stack([np.roll(offsets[:, 1], 1), offsets[:, 0]], axis=1)
     uncertain = np.stack([np.roll(variances[:, 1], 1), variances[:, 0]], axis=1)
