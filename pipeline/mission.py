@@ -166,8 +166,11 @@ class Mission(Section):
         return cls.parse(text, source=str(path))
 
     def to_json(self) -> str:
-        """Return the mission as indented JSON, which ``parse`` reads back unchanged."""
-        return json.dumps(self.model_dump(mode="json"), indent=2) + "\n"
+        """Return what the mission says as indented JSON, which ``parse`` reads back unchanged.
+
+        Sections it leaves to the defaults stay so: a recording follows the tuning of the version that replays it.
+        """
+        return json.dumps(self.model_dump(mode="json", include=self.model_fields_set), indent=2) + "\n"
 
     def marker(self, marker_id: int) -> MarkerSection | None:
         """Return a marker of the map, or None when it is not on the target."""

@@ -45,7 +45,10 @@ CAMERA = Camera(
     width=1280,
     height=720,
 )
-APPROACH = Approach(duration_s=22.0)
+APPROACH = Approach(
+    duration_s=22.0, sway_rad=(0.035, 0.025), tilt_rad=(0.05, -0.07, 0.06), tumble_rad=(0.05, 0.06, 0.05)
+)
+"""Off the port's axis by 8.2 degrees at most: inside the mission's corridor all the way."""
 MARKER_ID, SIDE_M = 7, 0.1
 LOOKING_FORWARD = PoseSection(translation_m=(0.25, 0.0, 0.0), rotation_wxyz=(0.5, 0.5, 0.5, 0.5))
 """The camera in the middle of the chaser's port; its z along the chaser's x, its x to the chaser's y."""
