@@ -74,6 +74,7 @@ class Detector:
     ``side_m`` and ``surface`` hold for every marker that ``markers`` (id to ``MarkerSpec``) does not list.
     ``surface`` None is unknown: the code is read as flat, else through a thin-plate spline, and the pose is as
     if flat.  ``transfer`` is how the camera encodes light: "srgb" (ordinary 8-bit cameras) or "linear".
+    One detector serves one thread at a time.
     """
 
     def __init__(
@@ -185,14 +186,13 @@ class Detector:
         starts = list(self._starts(view, candidate, layer))
         if candidate.bent and starts and isinstance(starts[0], BentWarp):
             return grow(view.light, starts[0], layer)
-        own = (fit_own_edges(view.light, start, layer) for start in starts)
-        begun = next((fit for fit in own if fit is not None), None)
-        if begun is None:
-            return None
-        cells = layer_cells(view.gray, begun.warp, layer)
-        if self._codebook.read_as(cells, marker_id).correlation < PROMISING:
-            return None
-        return grow(view.light, begun.warp, layer)
+        for start in starts:
+            begun = fit_own_edges(view.light, start, layer)
+            if begun is not None:
+                cells = layer_cells(view.gray, begun.warp, layer)
+                if self._codebook.read_as(cells, marker_id).correlation >= PROMISING:
+                    return grow(view.light, begun.warp, layer)
+        return None
 
     def _with_other_pose(self, view: View, detection: Detection, fit: Fit) -> Detection:
         """Return the detection fitted from the other planar pose when corners allow both and the edges prefer it."""

@@ -102,6 +102,16 @@ def test_a_print_on_an_undescribed_cylinder_is_read_and_its_grid_follows_it() ->
     assert np.sqrt(((seen.warp_grid_px - truth) ** 2).sum(axis=-1).mean()) < 2.0
 
 
+@pytest.mark.parametrize("azimuth_rad", [0.3, 2.0, 5.0])
+def test_a_described_cylinder_is_read_at_50_degrees(azimuth_rad: float) -> None:
+    """Too bent to read as flat: a spline and an alignment read it, the declared surface then gives the pose."""
+    tilt = np.radians(50.0) * np.array([np.cos(azimuth_rad), np.sin(azimuth_rad), 0.0])
+    T = pose(FACING @ exp_so3([0.0, 0.0, 1.0]) @ exp_so3(tilt), [0.0, 0.0, 0.8])
+    seen = one(Detector(surface=CYLINDER).detect(photograph(T, CYLINDER), CAMERA))
+    error = difference(T, seen.T_cam_marker)
+    assert np.linalg.norm(error[:3]) < 2e-3 and np.linalg.norm(error[3:]) < np.radians(0.5)
+
+
 def test_two_prints_of_one_identity_are_two_detections() -> None:
     left, right = (photograph(pose(FACING, [x, 0.0, 0.8]), Flat()) for x in (-0.15, 0.15))
     both = np.hstack([left[:, :640], right[:, 640:]])
