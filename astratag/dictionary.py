@@ -137,8 +137,9 @@ class Dictionary:
         """Return the reading that correlates best with brightnesses (48,), of all there are: maximum likelihood.
 
         Regions are those of the image: TL, TR, BR, BL, L, T, R, B.  ``erased`` (8,) booleans name some that do not
-        count; up to ``most_missing`` more may be left out where the others then fit far better.  ``threshold`` is
-        the least correlation to accept, by default the one that chance passes once in a million candidates.
+        count; up to ``most_missing`` more may be left out where the others then fit far better: three, a covered
+        side, are found without mistakes, more with a wrong id now and then.  ``threshold`` is the least correlation
+        to accept, by default the one that chance passes once in a million candidates.
         Raises ValueError for cells or flags of another shape, or cells that are not finite.
         """
         search = Search(self._words.size, threshold, most_missing)

@@ -26,6 +26,10 @@ LEAST_CONTRAST = 1e-9
 """Cells that spread less than this, as a fraction of their size, are all alike."""
 SAME_FIT = 1e-9
 """Two readings that correlate as closely as this cannot be told apart."""
+CREDIBLE = 0.999
+"""Correlations above this are taken for this: cells are never read so well that more of them would not tell more."""
+CLEAR = 1e4
+"""Where regions may be missing chance must explain every other reading so many times better than the one found."""
 
 
 @dataclass(frozen=True)
@@ -104,26 +108,29 @@ def decide(
     """Return the reading among ``codes`` (N, 48) that chance explains least, or why none is good enough.
 
     ``identify`` says whose code n is and how it is turned.  With regions that may be missing every choice of them
-    is tried and counts as one more comparison; all choices that are accepted must agree.
+    is tried and counts as one more comparison.
     """
     if not kept.any():
         return Rejected("no region is left")
     choices, left = with_regions_missing(kept, search.most_missing)
     count = left.sum(axis=1)
     scores = correlations(cells, left, codes)
-    best = scores.argmax(axis=1)
     score = scores.max(axis=1)
-    floor = {n: acceptance_threshold(search.readings, len(choices), cells=n) for n in set(count.tolist())}
-    needed = np.array([floor[n] if search.threshold is None else search.threshold for n in count.tolist()])
-    accepted = (score >= needed) & (score > 0)
-    surest = int(np.where(accepted, chance_of_correlation(score, np.maximum(count, 3)), np.inf).argmin())
     if not (score > 0).any():
         return Rejected("the cells show no contrast")
-    if not accepted.any():
+    floor = {n: acceptance_threshold(search.readings, len(choices), cells=n) for n in set(count.tolist())}
+    needed = np.array([floor[n] if search.threshold is None else search.threshold for n in count.tolist()])
+    chance = np.where(score >= needed, chance_of_correlation(np.minimum(score, CREDIBLE), count), np.inf)
+    surest = int(chance.argmin())
+    if np.isinf(chance[surest]):
         return Rejected(f"the best correlation is {score[0]:.3f}, below {needed[0]:.3f}")
-    if len(np.unique(best[accepted])) > 1 or (scores[surest] > score[surest] - SAME_FIT).sum() > 1:
+    code = int(scores[surest].argmax())
+    scores[:, code] = -1.0
+    rival = scores.max(axis=1)
+    rival_chance = chance_of_correlation(np.minimum(rival, CREDIBLE), count).min()
+    unclear = len(choices) > 1 and rival_chance < CLEAR * chance[surest]
+    if unclear or rival[surest] > score[surest] - SAME_FIT:
         return Rejected("two readings fit alike in the regions in view")
-    code = int(best[surest])
     identity = identify(code)
     if identity is None:
         return Rejected("the best codeword looks the same after half a turn and is nobody's")
