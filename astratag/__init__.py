@@ -4,7 +4,7 @@ from astratag.annotate import annotate
 from astratag.camera import Camera
 from astratag.detection import Detection, LayerDetection, PlanarPose
 from astratag.detector import Detector, MarkerSpec
-from astratag.dictionary import Dictionary, load_dictionary
+from astratag.dictionary import Dictionary, load_dictionary, write_dictionary
 from astratag.surface import Cylinder, Flat, Surface
 from astratag.tracker import Tracker
 
@@ -22,4 +22,5 @@ __all__ = [
     "Tracker",
     "annotate",
     "load_dictionary",
+    "write_dictionary",
 ]

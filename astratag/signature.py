@@ -8,12 +8,12 @@ removed, and what is left is correlated with every code in every orientation: so
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from astratag.codes import Reading
 from astratag.dictionary import Dictionary
 from astratag.geometry import CELLS, DRAWN_OFFSET, LAYERS, QUIET_MARGIN, TEMPLATE_UNITS, cell_polygons, layer_points
 
@@ -59,16 +59,6 @@ ALWAYS_BLACK = _always_black()
 SAMPLES = np.concatenate([CELL_SAMPLES.reshape(-1, 2), ALWAYS_BLACK])
 _ILLUMINATION = _smooth(CELL_SAMPLES.mean(axis=1)) @ np.linalg.pinv(_smooth(ALWAYS_BLACK))
 """Takes the always-black samples (B,) to the black level at the cells (48,)."""
-
-
-@dataclass(frozen=True)
-class Reading:
-    """The best explanation of one pattern: which code, turned clockwise by how many quarters, how well."""
-
-    marker_id: int
-    quarter_turns: int
-    correlation: float
-    hamming: int
 
 
 class Codebook:
