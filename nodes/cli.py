@@ -75,6 +75,8 @@ def _parser() -> argparse.ArgumentParser:
     _detect(command("detect", "nodes.tools:detect", "Find markers in images, folders, videos and recordings.", example))
     example = "relnav marker 0 1 2 --side-mm 100 --format pdf --out markers"
     _marker(command("marker", "nodes.tools:marker", "Draw markers to print, at their exact size.", example))
+    example = "relnav dictionary astratag48h12 --count 100 --out fleet.json"
+    _dictionary(command("dictionary", "nodes.tools:dictionary", "Choose identities that are far apart.", example))
     score = command("score", "nodes.tools:score", "Score a recorded run.", "relnav score out/replay/run.mcap")
     score.add_argument("recording", metavar="RUN", type=Path, help="the run.mcap of a replay or a live run")
     example = "relnav recover out/live/run.mcap"
@@ -149,10 +151,23 @@ def _detect(parser: argparse.ArgumentParser) -> None:
 
 def _marker(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("ids", nargs="+", type=int, metavar="ID", help="numbers in the dictionary")
-    parser.add_argument("--family", default="astratag20", metavar="F", help="dictionary (default: %(default)s)")
+    parser.add_argument(
+        "--family",
+        default="astratag20",
+        metavar="F",
+        help="astratag20, astratag48h16, astratag48h12, astratag48h9 or a dictionary's JSON (default: %(default)s)",
+    )
     parser.add_argument("--side-mm", type=_positive, default=100.0, metavar="S", help="outer square (%(default)s mm)")
     parser.add_argument("--format", choices=("svg", "pdf", "png"), default="svg", help="default: %(default)s")
     parser.add_argument("--out", type=Path, default=Path("out/markers"), help="folder (default: %(default)s)")
+
+
+def _dictionary(parser: argparse.ArgumentParser) -> None:
+    families = ("astratag48h16", "astratag48h12", "astratag48h9")
+    parser.add_argument("family", choices=families, help="1008, 64512 or 4193280 identities, 16, 12 or 9 cells apart")
+    parser.add_argument("--count", type=int, required=True, metavar="N", help="how many identities")
+    parser.add_argument("--seed", type=int, default=0, help="another seed, another choice (default: %(default)s)")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON that --dictionary reads")
 
 
 def _node(parser: argparse.ArgumentParser) -> None:

@@ -1,4 +1,4 @@
-"""The commands that need no bus: ``relnav detect``, ``marker``, ``score`` and ``recover``."""
+"""The commands that need no bus: ``relnav detect``, ``marker``, ``dictionary``, ``score`` and ``recover``."""
 
 from __future__ import annotations
 
@@ -49,18 +49,35 @@ def marker(args: argparse.Namespace) -> None:
     from astratag.artwork import write_artwork
     from astratag.dictionary import load_dictionary
 
-    dictionary = load_dictionary(args.family)
-    for marker_id in args.ids:
+    dictionary = load_dictionary(args.family, ids=sorted(set(args.ids)))
+    for marker_id in dictionary.ids:
         path = args.out / f"{dictionary.family}_{marker_id:02d}_{args.side_mm:g}mm.{args.format}"
         print(write_artwork(dictionary, marker_id, path, side_m=args.side_mm / 1000.0))
 
 
+def dictionary(args: argparse.Namespace) -> None:
+    """Choose identities of a family and write them as a dictionary."""
+    from astratag.codes import FAMILIES, select_identities
+    from astratag.dictionary import load_dictionary, write_dictionary
+
+    ids = select_identities(FAMILIES[args.family], args.count, args.seed)
+    chosen = load_dictionary(args.family, ids=ids)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    path = write_dictionary(chosen, args.out)
+    print(f"{path}: {len(chosen)} identities of {args.family}, {chosen.minimum_distance} cells apart")
+
+
 def score(args: argparse.Namespace) -> None:
-    """Print a recorded run's score."""
+    """Print a recorded run's score, and draw it beside the recording."""
+    from pipeline.report import write_report
     from pipeline.scoring import print_table
     from pipeline.scoring import score as score_recording
 
-    print_table(score_recording(args.recording), Console(highlight=False))
+    summary = score_recording(args.recording)
+    print_table(summary, Console(highlight=False))
+    report = args.recording.with_suffix(".report.png")
+    write_report(args.recording, summary, report)
+    print(f"written: {report}")
 
 
 def recover(args: argparse.Namespace) -> None:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+from astratag.dictionary import load_dictionary
 from nodes.cli import main
 from nodes.run import SHIPPED_RECORDING
 from pipeline.convert import calibration_message
@@ -21,7 +22,7 @@ from schemas import Envelope, Stamp
 from schemas.topics import FRAME
 from tests.small_recording import CAMERA, MISSION, write_small_recording
 
-COMMANDS = ("replay", "live", "detect", "marker", "score", "recover", "doctor", "node")
+COMMANDS = ("replay", "live", "detect", "marker", "dictionary", "score", "recover", "doctor", "node")
 
 
 @pytest.fixture(scope="module")
@@ -167,6 +168,14 @@ def test_markers_are_written_and_listed(capsys, tmp_path):
     paths = [Path(line) for line in capsys.readouterr().out.splitlines()]
     assert [path.name for path in paths] == ["astratag20_00_80mm.svg", "astratag20_07_80mm.svg"]
     assert all(path.stat().st_size > 0 for path in paths)
+
+
+def test_chosen_identities_are_written_as_a_dictionary(capsys, tmp_path):
+    fleet = tmp_path / "fleet.json"
+    assert main(["dictionary", "astratag48h16", "--count", "20", "--out", str(fleet)]) == 0
+    assert "20 identities" in capsys.readouterr().out
+    assert len(load_dictionary(fleet)) == 20
+    assert "1008" in refusal(capsys, "dictionary", "astratag48h16", "--count", "2000", "--out", fleet)
 
 
 def test_detections_are_listed_and_written_as_json(capsys, recording, tmp_path):
