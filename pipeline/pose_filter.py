@@ -220,7 +220,7 @@ class PoseFilter:
         frame.used = layers
         frame.log(
             Log.INFO,
-            f"acquired marker {marker.id} at {np.linalg.norm(self._bank.best.motion.p_chaser_target_m):.3f} m, "
+            f"acquired marker {marker.id}, {np.linalg.norm(poses[0][:3, 3]):.3f} m from the camera, "
             f"{len(self._bank.filters)} possible {'poses' if self._bank.is_ambiguous else 'pose'}",
         )
 
