@@ -8,6 +8,8 @@ Needs Vulkan; where there is no graphics card, Debian's mesa-vulkan-drivers comp
 from __future__ import annotations
 
 import argparse
+import os
+import signal
 import socket
 import subprocess
 import sys
@@ -37,11 +39,12 @@ def headless_viewer(rrd_path: Path, size_px: tuple[int, int] = SIZE_PX) -> Itera
     options = ("--headless", "--window-size", f"{size_px[0]}x{size_px[1]}", "--hide-welcome-screen")
     where = ("--port", str(port), "--bind", LOCALHOST)
     quiet = subprocess.DEVNULL
-    with subprocess.Popen([*VIEWER_COMMAND, str(rrd_path), *options, *where], stdout=quiet, stderr=quiet) as process:
+    command = [*VIEWER_COMMAND, str(rrd_path), *options, *where]
+    with subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True) as process:
         try:
             yield _loaded(process, port)
         finally:
-            process.kill()
+            os.killpg(process.pid, signal.SIGKILL)  # the command is a script around the viewer's own process
 
 
 def _loaded(process: subprocess.Popen[bytes], port: int) -> ViewerClient:
