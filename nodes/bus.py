@@ -84,10 +84,13 @@ class Presence:
 
 @dataclass(frozen=True)
 class Credit:
-    """What a node has dealt with: every frame up to ``sequence``; and, once it has ended, all it published."""
+    """What a node has dealt with: every frame up to ``sequence``, so many latched values; and all it published,
+    once it has ended.
+    """
 
     node: str
     sequence: int = -1
+    latched: int = 0
     ended: bool = False
     published: dict[str, int] = field(default_factory=dict)
     """Messages by topic name; counted by the others before they end in their turn."""
@@ -271,7 +274,7 @@ def _open(link: Link) -> zenoh.Session:
         if link.role == "hub":
             raise BusError(
                 f"cannot listen on {link.endpoint}: is the port in use? Stop the other run, or choose another "
-                "with --listen tcp/127.0.0.1:PORT"
+                "port, 65535 at most, with --listen tcp/127.0.0.1:PORT"
             ) from error
         raise BusError(
             f"cannot reach a Zenoh router at {link.endpoint}. Is it running, and is the address of the form "

@@ -79,7 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     _dictionary(command("dictionary", "nodes.tools:dictionary", "Choose identities that are far apart.", example))
     score = command("score", "nodes.tools:score", "Score a recorded run.", "relnav score out/replay/run.mcap")
     score.add_argument("recording", metavar="RUN", type=Path, help="the run.mcap of a replay or a live run")
-    example = "relnav recover out/live/run.mcap"
+    example = "relnav recover run.mcap"
     recover = command("recover", "nodes.tools:recover", "Make a recording whole that was cut off.", example)
     recover.add_argument("recording", metavar="FILE", type=Path, help="the truncated recording")
     recover.add_argument("--out", type=Path, help="where the whole one goes (default: FILE.recovered.mcap beside it)")
@@ -111,12 +111,13 @@ def _live(parser: argparse.ArgumentParser) -> None:
         default="tcp/127.0.0.1:7447",
         help="where others can join the bus (default: %(default)s)",
     )
-    _run_options(parser, out="out/live")
+    _run_options(parser, out=None)
     _source_options(parser)
 
 
-def _run_options(parser: argparse.ArgumentParser, *, out: str) -> None:
-    parser.add_argument("--out", type=Path, default=Path(out), help="folder for the results (default: %(default)s)")
+def _run_options(parser: argparse.ArgumentParser, *, out: str | None) -> None:
+    default = out or "out/live/ and the time"
+    parser.add_argument("--out", type=Path, default=out and Path(out), help=f"folder for the results ({default})")
     parser.add_argument(
         "--view",
         choices=("auto", "native", "web", "none"),

@@ -30,9 +30,12 @@ class Health:
 
     def publish_when_due(self, bus: Bus) -> None:
         """Publish if a second has passed since the last time."""
+        if time.monotonic() >= self._due_s:
+            self.publish(bus)
+
+    def publish(self, bus: Bus) -> None:
+        """Publish now."""
         now_s = time.monotonic()
-        if now_s < self._due_s:
-            return
         self._due_s = now_s + PERIOD_S
         t_ns = time.time_ns()
         message = NodeHealth(

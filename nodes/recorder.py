@@ -9,7 +9,7 @@ from pathlib import Path
 from nodes.bus import Received
 from nodes.shell import NodeError
 from pipeline.mission import Mission
-from pipeline.recording import Recording, RecordingError, RecordingWriter, recover
+from pipeline.recording import NothingRecordedError, Recording, RecordingError, RecordingWriter, recover
 from schemas import Envelope
 
 FLUSH_PERIOD_NS = 250_000_000
@@ -33,6 +33,10 @@ class RecorderWork:
             self._writer.write(received.envelope, received.t_receipt_ns)
         except RecordingError as error:
             raise NodeError(str(error)) from error
+        return []
+
+    def refuse(self, envelope: Envelope) -> Iterable[Envelope]:
+        """Nothing follows."""
         return []
 
     def idle(self, t_ns: int) -> Iterable[Envelope]:
@@ -59,11 +63,14 @@ def existing_parts(directory: Path) -> list[Path]:
 
 
 def join_parts(directory: Path, mission: Mission) -> Path:
-    """Make one whole ``run.mcap`` of a run's parts and return its path.  Raises RecordingError when there is none."""
+    """Make one whole ``run.mcap`` of a run's parts and return its path.
+
+    Raises RecordingError, and leaves all parts where they are, when there is none or one cannot be made whole.
+    """
     whole = []
     parts = existing_parts(directory)
     for part in parts:
-        with contextlib.suppress(RecordingError):  # killed before its first message
+        with contextlib.suppress(NothingRecordedError):  # killed before its first message
             recover(part, part)
             whole.append(part)
     if not whole:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
+import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 from rich.console import Console
@@ -15,20 +19,31 @@ from pipeline.mission import Mission
 RRD, SUMMARY, REPORT = "run.rrd", "summary.json", "report.png"
 
 
-def clear_results(out: Path, spec: str) -> None:
-    """Make the folder and take away the files of an earlier run, and only those.
+@contextlib.contextmanager
+def folder_for_results(out: Path, spec: str, *, overwrite: bool) -> Iterator[None]:
+    """Make the folder ours for as long as the run lasts.
 
-    Raises ValueError when the source itself is one of them, or the folder cannot be written.
+    ``overwrite`` takes away the files of an earlier run, and only those: a replay can be had again, a live run
+    cannot.  Raises ValueError when the folder cannot be written, is another run's, or holds what may not be lost.
     """
     stale = [*existing_parts(out), *(out / name for name in (RRD, SUMMARY, REPORT))]
     if Path(spec).resolve() in [path.resolve() for path in stale]:
         raise ValueError(f"{spec} would be overwritten by its own replay: choose another folder with --out")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        for path in stale:
-            path.unlink(missing_ok=True)
-    except OSError as error:
-        raise ValueError(f"cannot write to {out}: {error.strerror}") from error
+    with contextlib.ExitStack() as stack:
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+            folder = os.open(out, os.O_RDONLY)
+            stack.callback(os.close, folder)
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not overwrite and existing_parts(out):
+                raise ValueError(f"{out} holds the recording of an earlier run: choose another folder with --out")
+            for path in stale:
+                path.unlink(missing_ok=True)
+        except BlockingIOError as error:
+            raise ValueError(f"another run writes to {out}: choose another folder with --out") from error
+        except OSError as error:
+            raise ValueError(f"cannot write to {out}: {error.strerror}") from error
+        yield
 
 
 def finish_results(out: Path, mission: Mission, outcome: Outcome, console: Console) -> None:

@@ -8,6 +8,7 @@ import math
 import socket
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +23,7 @@ from nodes.cli import EXIT_INTERRUPTED
 from nodes.processes import PROCESSES
 from nodes.progress import RunProgress
 from nodes.recorder import join_parts
-from nodes.results import RRD, clear_results, finish_results
+from nodes.results import RRD, finish_results, folder_for_results
 from nodes.supervisor import Hooks, Outcome, Plan, RunError, Supervisor
 from pipeline.mission import Mission
 from pipeline.sources import Source, open_source
@@ -55,16 +56,16 @@ def replay(args: argparse.Namespace) -> int:
     view = _view(args, console)
     speed = args.speed or (math.inf if view == "none" else 1.0)
     speed_text = "max" if math.isinf(speed) else f"{speed:g}"
-    clear_results(args.out, spec)
-    _print_header(console, subject, args, view, f"speed {speed_text}")
-    if args.direct:
-        outcome = _run_direct(args, source, view, speed, console)
-    else:
-        del source
-        links = _links(args.connect, free_endpoint())
-        with _plan(args, subject, view, links, ["--speed", speed_text], lossless=True) as plan:
-            outcome = _run(plan, subject, args.out, console)
-    return _conclude(args.out, subject, outcome, console)
+    with folder_for_results(args.out, spec, overwrite=True):
+        _print_header(console, subject, args, view, f"speed {speed_text}")
+        if args.direct:
+            outcome = _run_direct(args, source, view, speed, console)
+        else:
+            del source
+            links = _links(args.connect, free_endpoint())
+            with _plan(args, subject, view, links, ["--speed", speed_text], lossless=True) as plan:
+                outcome = _run(plan, subject, args.out, console)
+        return _conclude(args.out, subject, outcome, console)
 
 
 def live(args: argparse.Namespace) -> int:
@@ -72,14 +73,15 @@ def live(args: argparse.Namespace) -> int:
     console = _console()
     subject = _subject(_open(args, args.source), args.source)
     view = _view(args, console)
-    clear_results(args.out, args.source)
-    _print_header(console, subject, args, view, f"router {args.connect}" if args.connect else f"bus {args.listen}")
-    links = _links(args.connect, args.listen)
-    with _plan(args, subject, view, links, ["--loop"] if args.loop else [], lossless=False) as plan:
-        outcome = _run(plan, subject, args.out, console)
-    if (subject.live or args.loop) and args.duration is None:
-        outcome = Outcome(completed=True, died=outcome.died)  # Ctrl-C is how such a run ends
-    return _conclude(args.out, subject, outcome, console)
+    args.out = args.out or Path("out/live", time.strftime("%Y%m%dT%H%M%SZ", time.gmtime()))
+    with folder_for_results(args.out, args.source, overwrite=False):
+        _print_header(console, subject, args, view, f"router {args.connect}" if args.connect else f"bus {args.listen}")
+        links = _links(args.connect, args.listen)
+        with _plan(args, subject, view, links, ["--loop"] if args.loop else [], lossless=False) as plan:
+            outcome = _run(plan, subject, args.out, console)
+        if (subject.live or args.loop) and args.duration is None:
+            outcome = Outcome(completed=True, died=outcome.died)  # Ctrl-C is how such a run ends
+        return _conclude(args.out, subject, outcome, console)
 
 
 def _console() -> Console:
@@ -218,7 +220,7 @@ def _run_direct(args: argparse.Namespace, source: Source, view: View, speed: flo
         recorder = RecordingWriter(args.out / "run.mcap", source.mission)
         sinks: list[Sink] = [stack.enter_context(viewer), stack.enter_context(recorder), progress]
         try:
-            replay_direct(source, sinks, speed="max" if math.isinf(speed) else speed)
+            replay_direct(source, sinks, speed="max" if math.isinf(speed) else speed, on_refused=warn)
         except KeyboardInterrupt:
             return Outcome(completed=False, died=frozenset())
     return Outcome(completed=True, died=frozenset())

@@ -8,8 +8,8 @@ and every message they published has arrived; then it says so and waits to be st
 
 Live.  Gaps are counted, and the node goes on until it is stopped.
 
-A message that the work refuses is counted, and an empty payload is sent in place of each per-frame answer,
-so that the nodes behind know that nothing will come for that frame.
+A message that the work refuses is counted and told to the user; the work then answers for its frame without it,
+so that the nodes behind hear of every frame.
 """
 
 from __future__ import annotations
@@ -59,6 +59,10 @@ class Work(Protocol):
         """Take one envelope and return what follows.  A ValueError refuses it."""
         ...
 
+    def refuse(self, envelope: Envelope) -> Iterable[Envelope]:
+        """Return what follows from an envelope that was refused."""
+        ...
+
     def idle(self, t_ns: int) -> Iterable[Envelope]:
         """Return what is due for the passing of time alone; called some ten times a second, UTC."""
         ...
@@ -105,7 +109,8 @@ class Shell:
         self._latches = {topic for topic in process.consumes if topic.latched and process.publishes}
         self._held: list[Received] = []
         self._held_since_s = self._idle_due_s = 0.0
-        self._credited = -1
+        self._latched = 0
+        self._acknowledged = (-1, 0)
         self._done = False
         self._end_deadline_s: float | None = None
 
@@ -157,6 +162,8 @@ class Shell:
         self._received[topic.name] += 1
         self._health.received += 1
         self._count_gap(received.envelope)
+        if topic.latched:
+            self._latched += 1
         if topic in self._latches:
             self._latches.discard(topic)
             self._handle(received)
@@ -186,26 +193,16 @@ class Shell:
     def _handle(self, received: Received) -> None:
         envelope = received.envelope
         try:
-            outputs = list(self._work.handle(received)) if envelope.payload else self._placeholders(envelope)
+            outputs = list(self._work.handle(received))
         except ValueError as error:
             self._health.refused += 1
-            self._health.note = f"refused {envelope.topic.name} {envelope.stamp.sequence}: {error}"
-            outputs = self._placeholders(envelope)
+            self._health.note = f"{self._process.name} refused {envelope.topic.name} {envelope.stamp.sequence}: {error}"
+            outputs = list(self._work.refuse(envelope))
         self._publish(outputs)
         self._health.last_sequence = envelope.stamp.sequence
         self._health.latency_s = (time.time_ns() - envelope.stamp.t_origin_ns) / 1e9
         if self._options.lossless:
             self._acknowledge()
-
-    def _placeholders(self, envelope: Envelope) -> list[Envelope]:
-        if not envelope.topic.per_frame:
-            return []
-        mission = self._options.mission
-        return [
-            Envelope(topic, topic.key(vehicle=mission.vehicle, camera=mission.camera.name), b"", envelope.stamp)
-            for topic in self._process.publishes
-            if topic.per_frame
-        ]
 
     def _publish(self, outputs: Iterable[Envelope]) -> None:
         for output in outputs:
@@ -214,10 +211,10 @@ class Shell:
             self._health.published += 1
 
     def _acknowledge(self) -> None:
-        sequence = min(self._sequences.get(topic, -1) for topic in self._process.paced_by)
-        if sequence > self._credited:
-            self._credited = sequence
-            self._bus.send(Credit(self._process.name, sequence))
+        dealt_with = min(self._sequences.get(topic, -1) for topic in self._process.paced_by), self._latched
+        if dealt_with != self._acknowledged:
+            self._acknowledged = dealt_with
+            self._bus.send(Credit(self._process.name, *dealt_with))
 
     def _pass_time(self) -> None:
         now_s = time.monotonic()
@@ -248,4 +245,6 @@ class Shell:
             return
         self._work.close()
         self._done = True
-        self._bus.send(Credit(self._process.name, self._credited, ended=True, published=dict(self._published)))
+        self._health.publish(self._bus)
+        credit = Credit(self._process.name, *self._acknowledged, ended=True, published=dict(self._published))
+        self._bus.send(credit)

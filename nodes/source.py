@@ -7,7 +7,6 @@ camera looked at it now, and what is overdue is left out.
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -20,7 +19,7 @@ from nodes.bus import Bus, Credit, Presence
 from nodes.health import Health
 from nodes.processes import process_named
 from nodes.shell import JOIN_PATIENCE_S, POLL_S, NodeError, NodeOptions, StopSignal
-from schemas import Envelope, Stamp, Truth, encode
+from schemas import CodecError, Envelope, Stamp, Truth, encode
 from schemas.topics import CALIBRATION, FRAME
 
 WINDOW = 8
@@ -68,7 +67,7 @@ class SourceNode:
         self._source, self._pace, self._options, self._bus, self._stop = source, pace, options, bus, stop
         self._health = Health("source", options.mission.vehicle)
         self._absent = set(options.companions)
-        self._credits: dict[str, int] = {}
+        self._credits: dict[str, Credit] = {}
         self._published: dict[str, int] = {}
 
     def run(self) -> None:
@@ -106,7 +105,11 @@ class SourceNode:
                     self._wait_until(due_s)
             if self._stop.is_set():
                 return
+            if envelope.topic is CALIBRATION and newest >= 0:
+                self._await_credit(newest + WINDOW)  # frames before it are seen with the calibration before it
             self._publish(envelope)
+            if envelope.topic is CALIBRATION:
+                self._await_latched()
 
     def _run_as_camera(self) -> None:
         shift_ns = None
@@ -114,7 +117,7 @@ class SourceNode:
             stamp = envelope.stamp
             resume = self._pace.resume
             if envelope.topic is CALIBRATION:
-                self._publish(envelope)
+                self._publish(retimed(envelope, time.time_ns()))
                 continue
             if shift_ns is None:
                 if resume is None:
@@ -133,7 +136,8 @@ class SourceNode:
             self._publish(retimed(envelope, t_live_ns))
 
     def _run_camera(self) -> None:
-        first = 0 if self._pace.resume is None else self._pace.resume.sequence + 1
+        # After a restart, past the frames that were on their way: the gap is counted.
+        first = 0 if self._pace.resume is None else self._pace.resume.sequence + 1 + WINDOW
         for envelope in self._source.envelopes():
             if self._stop.is_set():
                 return
@@ -154,12 +158,26 @@ class SourceNode:
         """Wait until frame ``sequence`` may be published."""
 
         def laggards() -> list[str]:
-            return [node for node, done in self._credits.items() if done < sequence - WINDOW]
+            return [node for node, credit in self._credits.items() if credit.sequence < sequence - WINDOW]
 
         if not self._turn_until(lambda: not laggards(), STALL_PATIENCE_S) and not self._stop.is_set():
             raise NodeError(
                 f"no progress for {STALL_PATIENCE_S:.0f} s before frame {sequence}: waiting for {', '.join(laggards())}"
             )
+
+    def _await_latched(self) -> None:
+        """Wait until every companion has the calibrations published so far."""
+        published = self._published[CALIBRATION.name]
+
+        def laggards() -> list[str]:
+            return [
+                node
+                for node, credit in self._credits.items()
+                if CALIBRATION in process_named(node).consumes and credit.latched < published
+            ]
+
+        if not self._turn_until(lambda: not laggards(), STALL_PATIENCE_S) and not self._stop.is_set():
+            raise NodeError(f"the calibration never reached {', '.join(laggards())}")
 
     def _wait_until(self, due_s: float) -> None:
         while not self._stop.is_set() and (left_s := due_s - time.monotonic()) > 0:
@@ -177,26 +195,25 @@ class SourceNode:
         match self._bus.mailbox.get(timeout_s):
             case Presence(node=node, alive=True) if node in self._absent:
                 self._absent.discard(node)
-                self._credits[node] = -1
+                self._credits[node] = Credit(node)
             case Presence(node=node, alive=False) if not process_named(node).required:
                 self._credits.pop(node, None)  # missed, not waited for
             case Credit(node=node, ended=True) if node in self._absent:
                 self._absent.discard(node)  # it died before it came up
-            case Credit(node=node, sequence=sequence) if node in self._credits:
-                self._credits[node] = sequence
+            case Credit(node=node) as credit if node in self._credits:
+                self._credits[node] = credit
         self._health.publish_when_due(self._bus)
 
 
 def repeated(envelopes: Callable[[], Iterable[Envelope]], *, loop: bool) -> Iterator[Envelope]:
     """Yield a recording once, or for ever with sequence numbers and stamps that go on."""
     sequence_offset = t_offset_ns = 0
-    for pass_number in itertools.count():
+    while True:
         first: Stamp | None = None
         last: Stamp | None = None
         for envelope in envelopes():
             if envelope.topic is CALIBRATION:
-                if pass_number == 0:
-                    yield envelope
+                yield envelope
                 continue
             if envelope.topic is FRAME:
                 first, last = first or envelope.stamp, envelope.stamp
@@ -215,10 +232,14 @@ def repeated(envelopes: Callable[[], Iterable[Envelope]], *, loop: bool) -> Iter
 
 
 def retimed(envelope: Envelope, t_capture_ns: int) -> Envelope:
-    """Return an envelope as if captured at ``t_capture_ns``, in its stamp and in its message."""
-    message = envelope.message()
+    """Return an envelope as if captured at ``t_capture_ns``, in its stamp and, unless damaged, in its message."""
+    envelope = replace(envelope, stamp=replace(envelope.stamp, t_capture_ns=t_capture_ns))
+    try:
+        message = envelope.message()
+    except CodecError:
+        return envelope  # for the detector to refuse
     if isinstance(message, CompressedImage | CameraCalibration):
         message.timestamp.FromNanoseconds(t_capture_ns)
     elif isinstance(message, Truth):
         message = message.model_copy(update={"t_capture_ns": t_capture_ns})
-    return replace(envelope, payload=encode(message), stamp=replace(envelope.stamp, t_capture_ns=t_capture_ns))
+    return replace(envelope, payload=encode(message))

@@ -37,6 +37,12 @@ class StepWork:
             self._sequence, self._t_last_ns = envelope.stamp.sequence, received.t_receipt_ns
         return self._wrap(self._step.step(envelope.message()), envelope.stamp)
 
+    def refuse(self, envelope: Envelope) -> Iterable[Envelope]:
+        """Answer for a frame whose message could not be used."""
+        if not envelope.topic.per_frame:
+            return []
+        return self._wrap(self._step.refused(envelope.stamp.t_capture_ns), envelope.stamp)
+
     def idle(self, t_ns: int) -> Iterable[Envelope]:
         """Tell a live step the time when its input has dried up."""
         if self._tick is None or self._sequence is None or t_ns - self._t_last_ns < QUIET_NS:

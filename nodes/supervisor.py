@@ -21,13 +21,15 @@ from pathlib import Path
 from nodes import ONE_THREAD
 from nodes.bus import Bus, Credit, Link, Presence, Received
 from nodes.processes import Process
-from schemas import CodecError, RelativeState, Stamp
-from schemas.topics import STATE
+from schemas import CodecError, NodeHealth, RelativeState, Stamp
+from schemas.topics import HEALTH, STATE
 
 POLL_S = 0.02
 STOP_PATIENCE_S = 3.0
 FINISH_PATIENCE_S = 15.0
 """For recorder and viewer to finish their files."""
+HANG_PATIENCE_S = 1.0
+"""For a process that is there and has left the bus: it is ending, or it hangs."""
 MOST_RESTARTS = 5
 RESTART_MEMORY_S = 30.0
 ERROR_PREFIX = "relnav: error: "
@@ -84,6 +86,9 @@ class Child:
     """It has announced itself on the bus."""
     died_s: float | None = None
     """When the one before it died, until it has announced itself."""
+    lapsed_s: float | None = None
+    """When it left the bus."""
+    hung: bool = False
     ended: bool = False
     lines: deque[str] = field(default_factory=lambda: deque(maxlen=50))
     reader: threading.Thread | None = None
@@ -98,6 +103,8 @@ class Child:
 
     def epitaph(self) -> str:
         """Return in a few words why it is no more."""
+        if self.hung:
+            return "it no longer answered and was killed"
         code = self.popen.returncode
         if code < 0:
             return f"killed by {signal.Signals(-code).name}"
@@ -117,6 +124,7 @@ class Supervisor:
         self._live_since_s: float | None = None
         self._died: set[str] = set()
         self._excuse_due_s = 0.0
+        self._notes: dict[str, str] = {}
 
     def run(self) -> Outcome:
         """Run to the end, or until the user stops it.  Raises RunError and BusError."""
@@ -124,7 +132,7 @@ class Supervisor:
         previous = {number: signal.signal(number, lambda *_: self.stop()) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
             with Bus(plan.own_link, vehicle=plan.vehicle, node="supervisor", lossless=plan.lossless) as bus:
-                bus.subscribe([STATE])
+                bus.subscribe([STATE, HEALTH])
                 bus.watch()
                 try:
                     for process in reversed(plan.processes):  # whoever is waited for first
@@ -188,26 +196,34 @@ class Supervisor:
                 self._show(event)
             case Presence(node=name, alive=True) if name in self._children:
                 self._welcome(self._children[name])
+            case Presence(node=name, alive=False) if name in self._children:
+                self._children[name].lapsed_s = time.monotonic()
             case Credit(node=name, ended=True) if name in self._children:
                 self._children[name].ended = True
         for child in list(self._children.values()):
+            if child.lapsed_s is not None and time.monotonic() - child.lapsed_s > HANG_PATIENCE_S:
+                child.hung = True
+                child.popen.kill()
+                child.popen.wait()
             if child.popen.poll() is not None:
                 self._mourn(child)
 
     def _show(self, received: Received) -> None:
         stamp = received.envelope.stamp
-        if self._last_frame is None or stamp.sequence > self._last_frame.sequence:
-            self._last_frame = stamp
-        if received.envelope.payload:
-            try:
-                message = received.envelope.message()
-            except CodecError:
-                return
-            assert isinstance(message, RelativeState)
+        try:
+            message = received.envelope.message()
+        except CodecError:
+            return
+        if isinstance(message, RelativeState):
+            if self._last_frame is None or stamp.sequence > self._last_frame.sequence:
+                self._last_frame = stamp
             self._hooks.on_state(stamp, message)
+        elif isinstance(message, NodeHealth) and message.note and message.note != self._notes.get(message.node):
+            self._notes[message.node] = message.note
+            self._hooks.on_note(f"warning: {message.note}")
 
     def _welcome(self, child: Child) -> None:
-        child.alive = True
+        child.alive, child.lapsed_s = True, None
         if child.died_s is not None:
             self._hooks.on_note(f"{child.process.name} is back after {time.monotonic() - child.died_s:.1f} s")
             child.died_s = None
@@ -267,6 +283,7 @@ class Supervisor:
                 except subprocess.TimeoutExpired:
                     child.popen.kill()
                     child.popen.wait()
+                    self._died.add(child.process.name)
                     self._hooks.on_note(f"warning: the {child.process.name} did not stop when told and was killed")
                 child.close_pipes()
 

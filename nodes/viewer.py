@@ -20,6 +20,10 @@ class ViewerWork:
         self._viewer.write(received.envelope, received.t_receipt_ns)
         return []
 
+    def refuse(self, envelope: Envelope) -> Iterable[Envelope]:
+        """Nothing follows."""
+        return []
+
     def idle(self, t_ns: int) -> Iterable[Envelope]:
         """Nothing is due."""
         return []

@@ -83,6 +83,10 @@ class DetectorStep:
         )
         return [found, annotations_message(detections, found.t_capture_ns)]
 
+    def refused(self, t_capture_ns: int) -> Iterable[AnyMessage]:
+        """Return that nothing was found: the frame could not be looked at."""
+        return [Detections(t_capture_ns=t_capture_ns, camera=self._camera_name, width_px=0, height_px=0, detections=[])]
+
 
 def annotations_message(detections: Sequence[astratag.detection.Detection], t_capture_ns: int) -> ImageAnnotations:
     """Return a loop around each layer seen, the id at the first corner, and the grid of a curved print."""

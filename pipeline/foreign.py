@@ -36,6 +36,13 @@ def standard_message(schema: str, payload: bytes) -> tuple[bytes, int]:
     return payload, decode(kind, payload).timestamp.ToNanoseconds()
 
 
+def stamped(payload: bytes, t_capture_ns: int) -> bytes:
+    """Return an image with a time stamp put in."""
+    message = decode(CompressedImage, payload)
+    message.timestamp.FromNanoseconds(t_capture_ns)
+    return encode(message)
+
+
 def _png(raw: RawImage) -> bytes:
     """Return a raw image as PNG."""
     pixels = _pixels(raw)

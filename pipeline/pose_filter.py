@@ -85,6 +85,11 @@ class PoseFilter:
         with np.errstate(all="ignore"):  # what overflows is refused where it shows
             return self._frame(message)
 
+    def refused(self, t_capture_ns: int) -> Iterable[AnyMessage]:
+        """Return the state at a frame whose detections could not be read."""
+        camera = self._mission.camera.name
+        return self.step(Detections(t_capture_ns=t_capture_ns, camera=camera, width_px=0, height_px=0, detections=[]))
+
     def tick(self, t_ns: int) -> Iterable[AnyMessage]:
         """Return the state propagated to ``t_ns``, when no frame came for a while; nothing when there is none.
 

@@ -26,7 +26,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
 
-from pipeline.foreign import CALIBRATION_SCHEMAS, IMAGE_SCHEMAS, standard_message
+from pipeline.foreign import CALIBRATION_SCHEMAS, IMAGE_SCHEMAS, stamped, standard_message
 from pipeline.mission import ATTACHMENT, Mission
 from schemas import Envelope, Stamp, Topic
 from schemas.codec import descriptor_of, file_descriptor_set, schema_name
@@ -45,6 +45,10 @@ _FOOTER = struct.Struct("<xQQQI8s")
 
 class RecordingError(ValueError):
     """A recording that cannot be read or written, in one line that says what to do."""
+
+
+class NothingRecordedError(RecordingError):
+    """A recording without a single whole message."""
 
 
 class RecordingWriter:
@@ -224,8 +228,10 @@ class Recording:
             payload, t_capture_ns = standard_message(role.schema, record.data)
         except ValueError as error:
             raise RecordingError(f"{self.path}: {self._names[record.channel_id]}: {error}") from error
-        stamp = Stamp(number, t_capture_ns or record.publish_time or record.log_time, 0)
-        return Envelope(role.topic, role.key, payload, stamp)
+        if t_capture_ns == 0:
+            t_capture_ns = record.publish_time or record.log_time
+            payload = stamped(payload, t_capture_ns) if role.topic is FRAME else payload
+        return Envelope(role.topic, role.key, payload, Stamp(number, t_capture_ns, 0))
 
     @contextlib.contextmanager
     def _readable(self) -> Iterator[IO[bytes]]:
@@ -343,7 +349,7 @@ def recover(path: str | Path, out: str | Path | None = None) -> RecoverReport:
             _require_magic(path, file)
             messages, lost_bytes = _copy_intact(file, _open_writer(part_file))
         if messages == 0:
-            raise RecordingError(f"{path} holds no complete message: nothing to recover")
+            raise NothingRecordedError(f"{path} holds no complete message: nothing to recover")
         part.replace(out)
     except OSError as error:
         raise RecordingError(f"cannot recover {path} to {out}: {error.strerror}") from error

@@ -16,7 +16,7 @@ from pipeline.convert import NS_PER_S
 from pipeline.recording import Recording
 from pipeline.source import Source
 from pipeline.steps import STEPS, Sink, Step, StepSpec
-from schemas import Envelope, Message, Topic
+from schemas import CodecError, Envelope, Message, Topic
 from schemas.topics import ANNOTATIONS, DETECTIONS, EVENTS, FRAME, STATE, TRANSFORMS
 
 Speed = float | Literal["max"]
@@ -39,13 +39,20 @@ def replay_direct(
     *,
     speed: Speed = "max",
     on_frame: Callable[[Envelope], None] | None = None,
+    on_refused: Callable[[str], None] = lambda reason: None,
     steps: Sequence[StepSpec] = STEPS,
 ) -> ReplayCounts:
-    """Run a source through the steps into the sinks; ``on_frame`` is called when a frame is through.
+    """Run a source through the steps into the sinks; ``on_frame`` is called when a frame is through, ``on_refused``
+    with the reason when a step cannot use a message.
 
     ``speed`` is a multiple of the recorded pace.  The sinks stay open: they are the caller's.
     """
     counts = ReplayCounts()
+
+    def refuse(reason: str) -> None:
+        counts.refused += 1
+        on_refused(reason)
+
     built = [(spec, spec.build(source.mission)) for spec in steps]
     for envelope in paced(source.envelopes(), speed):
         entered = replace(envelope, stamp=replace(envelope.stamp, t_origin_ns=time.time_ns()))
@@ -53,8 +60,11 @@ def replay_direct(
         while queue:
             current = queue.popleft()
             for sink in sinks:
-                sink.write(current, time.time_ns())
-            queue.extend(_answers(current, built, source, counts))
+                try:
+                    sink.write(current, time.time_ns())
+                except CodecError as error:
+                    on_refused(f"{type(sink).__name__.lower()} refused {current.topic.name}: {error}")
+            queue.extend(_answers(current, built, source, refuse))
         if envelope.topic is FRAME:
             counts.frames += 1
             if on_frame is not None:
@@ -63,17 +73,17 @@ def replay_direct(
 
 
 def _answers(
-    envelope: Envelope, built: Iterable[tuple[StepSpec, Step]], source: Source, counts: ReplayCounts
+    envelope: Envelope, built: Iterable[tuple[StepSpec, Step]], source: Source, refuse: Callable[[str], None]
 ) -> Iterator[Envelope]:
-    """Yield what the steps that consume an envelope make of it; a message that a step refuses is counted."""
+    """Yield what the steps that consume an envelope make of it, or of its frame when they refuse it."""
     for spec, step in built:
         if envelope.topic not in spec.consumes:
             continue
         try:
             messages = list(step.step(envelope.message()))
-        except ValueError:
-            counts.refused += 1
-            continue
+        except ValueError as error:
+            refuse(f"{spec.name} refused {envelope.topic.name} {envelope.stamp.sequence}: {error}")
+            messages = list(step.refused(envelope.stamp.t_capture_ns)) if envelope.topic.per_frame else []
         for message in messages:
             yield Envelope.wrap(
                 message, envelope.stamp, vehicle=source.mission.vehicle, camera=source.mission.camera.name

@@ -19,7 +19,11 @@ class Step(Protocol):
     """A node's work on one message."""
 
     def step(self, message: AnyMessage) -> Iterable[AnyMessage]:
-        """Take one message and return what follows from it, in order."""
+        """Take one message and return what follows from it, in order.  Raises ValueError when it cannot be used."""
+        ...
+
+    def refused(self, t_capture_ns: int) -> Iterable[AnyMessage]:
+        """Return what follows from a frame whose message could not be used: everybody hears of every frame."""
         ...
 
 

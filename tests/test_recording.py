@@ -404,3 +404,12 @@ def test_a_stamp_that_cannot_be_recorded_is_refused_and_harms_nothing(tmp_path: 
             writer.write(wrap(state, stamp), 1)
         writer.write(wrap(state, Stamp(1, 2, 2)), 2)
     assert [row[2] for row in plain(Recording(tmp_path / "x.mcap"))] == [0, 1]
+
+
+def test_a_foreign_image_without_a_stamp_is_given_the_time_of_its_publication(tmp_path: Path) -> None:
+    """In its message as in its envelope, for the filter goes by the message."""
+    bare = CompressedImage(frame_id="cam", format="jpeg", data=image_message(0).data)
+    recording = Recording(foreign(tmp_path / "x.mcap", {"/cam/image": [bare]}))
+    ((envelope, _),) = recording.envelopes([FRAME])
+    assert envelope.stamp.t_capture_ns > 0
+    assert envelope.message().timestamp.ToNanoseconds() == envelope.stamp.t_capture_ns

@@ -37,6 +37,10 @@ class StubDetector:
         t_ns = message.timestamp.ToNanoseconds()
         yield Detections(t_capture_ns=t_ns, camera=self._camera, width_px=self._width_px, height_px=1, detections=[])
 
+    def refused(self, t_capture_ns: int) -> Iterable[AnyMessage]:
+        """Say that nothing was seen."""
+        yield Detections(t_capture_ns=t_capture_ns, camera=self._camera, width_px=0, height_px=0, detections=[])
+
 
 class StubFilter:
     """Counts detections; logs the first."""
@@ -50,6 +54,10 @@ class StubFilter:
         yield RelativeState(t_capture_ns=message.t_capture_ns, mode=Mode.TRACK, nis=float(self._count))
         if self._count == 1:
             yield Log(level=Log.INFO, message="acquired")
+
+    def refused(self, t_capture_ns: int) -> Iterable[AnyMessage]:
+        """Say nothing."""
+        return []
 
 
 STUBS = (
@@ -108,7 +116,7 @@ def test_every_sink_is_given_everything_and_progress_is_told(recording: Path) ->
     assert through == list(range(FRAMES))
 
 
-def test_what_a_step_refuses_is_counted_and_the_rest_goes_on(tmp_path: Path) -> None:
+def test_what_a_step_refuses_is_counted_told_and_answered(tmp_path: Path) -> None:
     def damage(e: Envelope) -> Envelope:
         if e.topic is not FRAME or e.stamp.sequence not in (2, 4):
             return e
@@ -119,9 +127,11 @@ def test_what_a_step_refuses_is_counted_and_the_rest_goes_on(tmp_path: Path) -> 
 
     run = write_run(tmp_path / "run.mcap", ((damage(e), t_ns) for e, t_ns in run_envelopes(FRAMES)))
     sink = Collector()
-    counts = replay_direct(open_source(run), [sink], steps=STUBS)
+    told: list[str] = []
+    counts = replay_direct(open_source(run), [sink], steps=STUBS, on_refused=told.append)
     assert (counts.frames, counts.refused) == (FRAMES, 2)
-    assert [e.stamp.sequence for e, _ in sink.got if e.topic is STATE] == [0, 1, 3, 5]
+    assert [e.stamp.sequence for e, _ in sink.got if e.topic is STATE] == list(range(FRAMES))
+    assert told[0] == "detector refused frame 2: no image"
 
 
 def test_pace_is_the_recorded_one_divided_by_speed(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:

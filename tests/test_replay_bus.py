@@ -4,16 +4,21 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from astratag.camera import Camera
 from nodes.processes import PROCESSES
 from nodes.supervisor import Supervisor
-from pipeline.recording import Recording
+from pipeline.convert import calibration_message
+from pipeline.recording import Recording, RecordingWriter
 from pipeline.replay import REPEATABLE, differences
+from schemas import Envelope
 from schemas.topics import CALIBRATION, DETECTIONS, FRAME, HEALTH, STATE, TRUTH
-from tests.small_recording import plan, write_small_recording
+from tests.small_recording import CAMERA, plan, write_small_recording
 
 FRAMES = 40
 
@@ -73,3 +78,25 @@ def test_a_direct_replay_is_identical(by_command_line: Path, recording: Path, tm
     done = relnav("replay", recording, "--direct", "--out", tmp_path, "--view", "none")
     assert done.returncode == 0, done.stderr
     assert differences(by_command_line / "run.mcap", tmp_path / "run.mcap", REPEATABLE) == []
+
+
+def test_a_damaged_frame_and_a_calibration_that_changes_are_replayed_alike(recording: Path, tmp_path: Path):
+    """Frame 10 is no message, and from frame 20 on the focal length is another: over the bus as direct."""
+    odd = tmp_path / "odd.mcap"
+    source = Recording(recording)
+    with RecordingWriter(odd, source.mission) as writer:
+        for envelope, t_ns in source.envelopes():
+            if envelope.topic is TRUTH and envelope.stamp.sequence == 20:
+                longer = Camera(CAMERA.K * np.array([[1.01], [1.01], [1.0]]), width=CAMERA.width, height=CAMERA.height)
+                message = calibration_message(longer, frame_id="nav", t_capture_ns=envelope.stamp.t_capture_ns)
+                writer.write(Envelope.wrap(message, envelope.stamp, vehicle="chaser", camera="nav"), t_ns)
+            damaged = envelope.topic is FRAME and envelope.stamp.sequence == 10
+            writer.write(replace(envelope, payload=b"\xff\xff\xff") if damaged else envelope, t_ns)
+    bus = relnav("replay", odd, "--out", tmp_path / "bus", "--view", "none")
+    direct = relnav("replay", odd, "--out", tmp_path / "direct", "--view", "none", "--direct")
+    for done in (bus, direct):
+        assert done.returncode == 0, done.stderr
+        assert "detector refused frame 10" in done.stdout
+    runs = [tmp_path / name / "run.mcap" for name in ("bus", "direct")]
+    assert differences(*runs, REPEATABLE) == []
+    assert len(list(Recording(runs[0]).messages(STATE))) == FRAMES

@@ -56,20 +56,23 @@ class ScriptedBus:
 
 
 class Echo:
-    """Work that answers each frame with itself under another topic, and refuses what it is told to."""
+    """Work that answers each frame under another topic, and refuses the payload "refuse"."""
 
-    def __init__(self, answer: Topic, refuse: bytes = b"refuse"):
-        self.answer, self.refuse = answer, refuse
+    def __init__(self, answer: Topic):
+        self.answer = answer
         self.seen: list[Envelope] = []
         self.closed = False
 
     def handle(self, received: Received) -> list[Envelope]:
-        if received.envelope.payload == self.refuse:
+        if received.envelope.payload == b"refuse":
             raise ValueError("not for me")
         self.seen.append(received.envelope)
         if not received.envelope.topic.per_frame:
             return []
         return [Envelope(self.answer, self.answer.key(vehicle="chaser"), b"answer", received.envelope.stamp)]
+
+    def refuse(self, envelope: Envelope) -> list[Envelope]:
+        return [Envelope(self.answer, self.answer.key(vehicle="chaser"), b"nothing seen", envelope.stamp)]
 
     def idle(self, t_ns: int) -> list[Envelope]:
         return []
@@ -93,7 +96,7 @@ def run(*events: Event, node: str = "detector", lossless: bool = True, companion
 
 def test_every_frame_is_acknowledged_in_a_replay():
     bus, _ = run(arrived(CALIBRATION, 0), *(arrived(FRAME, k) for k in range(3)))
-    assert bus.credits == [Credit("detector", k) for k in range(3)]
+    assert bus.credits == [Credit("detector", k, latched=1) for k in range(-1, 3)]
     assert [e.stamp.sequence for e in bus.answers(DETECTIONS)] == [0, 1, 2]
 
 
@@ -128,23 +131,21 @@ def test_frames_without_a_calibration_are_an_error_after_a_while(monkeypatch):
         run(arrived(FRAME, 0))
 
 
-def test_a_refused_frame_is_counted_and_passed_on_as_nothing(monkeypatch):
-    """A broken image: nobody behind waits for its detections, and the next frame goes on."""
+def test_a_refused_frame_is_counted_told_and_answered(monkeypatch):
+    """A broken image: those behind hear that nothing was seen in it, and the next frame goes on."""
     monkeypatch.setattr("nodes.health.PERIOD_S", 0.0)
     bus, _ = run(arrived(CALIBRATION, 0), arrived(FRAME, 0, b"refuse"), arrived(FRAME, 1))
-    assert [e.payload for e in bus.answers(DETECTIONS)] == [b"", b"answer"]
+    assert [e.payload for e in bus.answers(DETECTIONS)] == [b"nothing seen", b"answer"]
     assert bus.health().refused == 1
-    bus, work = run(arrived(CALIBRATION, 0), arrived(DETECTIONS, 0, b""), arrived(DETECTIONS, 1), node="pose_filter")
-    assert [e.payload for e in bus.answers(STATE)] == [b"", b"answer"]
-    assert [e.topic for e in work.seen] == [CALIBRATION, DETECTIONS]
-    assert bus.credits == [Credit("pose_filter", 0), Credit("pose_filter", 1)]
+    assert bus.health().note == "detector refused frame 0: not for me"
+    assert bus.credits[-1] == Credit("detector", 1, latched=1)
 
 
 def test_a_node_ends_when_all_that_was_published_has_arrived():
     """The source's last word overtakes its last frame."""
     last_word = Credit("source", 1, ended=True, published={"frame": 2, "calibration": 1})
     bus, work = run(arrived(CALIBRATION, 0), arrived(FRAME, 0), last_word, arrived(FRAME, 1))
-    assert bus.credits[-1] == Credit("detector", 1, ended=True, published={"detections": 2})
+    assert bus.credits[-1] == Credit("detector", 1, latched=1, ended=True, published={"detections": 2})
     assert work.closed
 
 

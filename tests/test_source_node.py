@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import replace
 
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
@@ -24,16 +25,22 @@ def recording(frames: int) -> Iterator[Envelope]:
         yield Envelope(FRAME, "f", b"", Stamp(k, START_NS + k * PERIOD_NS, 0))
 
 
+def changed(envelopes: Iterator[Envelope], later: int) -> Iterator[Envelope]:
+    """Yield envelopes with their sequence numbers moved."""
+    for envelope in envelopes:
+        yield replace(envelope, stamp=replace(envelope.stamp, sequence=envelope.stamp.sequence + later))
+
+
 def test_a_recording_played_once_is_itself():
     assert list(repeated(lambda: recording(3), loop=False)) == list(recording(3))
 
 
 def test_a_recording_repeated_goes_on_in_number_and_time():
-    played = list(itertools.islice(repeated(lambda: recording(3), loop=True), 10))
+    played = list(itertools.islice(repeated(lambda: recording(3), loop=True), 12))
     frames = [envelope.stamp for envelope in played if envelope.topic is FRAME]
     assert [stamp.sequence for stamp in frames] == list(range(9))
     assert [stamp.t_capture_ns - START_NS for stamp in frames] == [k * PERIOD_NS for k in range(9)]
-    assert sum(envelope.topic is CALIBRATION for envelope in played) == 1
+    assert [k for k, envelope in enumerate(played) if envelope.topic is CALIBRATION] == [0, 4, 8]
 
 
 def test_an_empty_recording_is_not_repeated_for_ever():
@@ -68,7 +75,10 @@ class Others:
         self.last_word: Credit | None = None
         self.names = names
         self.most_in_flight = 0
+        self.frames_before_calibrations: list[tuple[int, int]] = []
+        """Frames published, and those acknowledged by all, at each calibration."""
         self.acknowledged = dict.fromkeys(names, -1)
+        self.latched = 0
 
     def get(self, timeout_s: float) -> Event | None:
         if self.events:
@@ -76,7 +86,7 @@ class Others:
         behind = min(self.names, key=self.acknowledged.__getitem__)
         if self.acknowledged[behind] < len(self.published) - 1:
             self.acknowledged[behind] += 1
-            return Credit(behind, self.acknowledged[behind])
+            return Credit(behind, self.acknowledged[behind], self.latched)
         return None
 
     def watch(self, nodes: object) -> None: ...
@@ -87,6 +97,10 @@ class Others:
         if envelope.topic is FRAME:
             self.published.append(envelope)
             self.most_in_flight = max(self.most_in_flight, len(self.published) - 1 - min(self.acknowledged.values()))
+        elif envelope.topic is CALIBRATION:
+            self.latched += 1
+            self.frames_before_calibrations.append((len(self.published), min(self.acknowledged.values()) + 1))
+            self.events += [Credit(name, self.acknowledged[name], self.latched) for name in self.names]
 
     def send(self, credit: Credit) -> None:
         self.last_word = credit
@@ -119,6 +133,22 @@ def test_a_replay_keeps_a_window_of_frames_in_flight_and_counts_what_it_publishe
     assert others.most_in_flight == WINDOW
     assert others.last_word == Credit("source", 39, ended=True, published={"calibration": 1, "frame": 40})
     assert all(envelope.stamp.t_origin_ns > 0 for envelope in others.published)
+
+
+def test_a_calibration_that_changes_finds_everybody_at_the_same_frame():
+    """What came before it is dealt with before it is published, so that no node mixes the two."""
+    others = Others(("detector", "recorder"))
+    film = Film(20)
+    film.envelopes = lambda: itertools.chain(recording(20), changed(recording(5), 20))  # type: ignore[method-assign]
+    options = NodeOptions(Mission(), True, others.names)
+    SourceNode(film, Pace(speed=None), options, others, others).run()  # type: ignore[arg-type]
+    assert others.frames_before_calibrations == [(0, 0), (20, 20)]
+    assert len(others.published) == 25
+
+
+def test_a_damaged_message_is_passed_on_for_the_detector_to_refuse():
+    damaged = Envelope(FRAME, "f", b"\xff\xff\xff", Stamp(4, 5, 6))
+    assert retimed(damaged, 7) == Envelope(FRAME, "f", b"\xff\xff\xff", Stamp(4, 7, 6))
 
 
 def test_a_viewer_that_dies_is_not_waited_for():
