@@ -22,8 +22,6 @@ EASY = Scene(side_px=150, tilt_deg=(0, 20))
 def test_reads_its_own_print_where_it_was_laid(entrant: Entrant, size: str):
     if entrant.absent:
         pytest.skip(f"{entrant.needs} is not installed; uv sync --extra peers")
-    if entrant.marker == "tagCustom48h12":
-        pytest.skip("tagCustom48h12 builds a table of gigabytes; the benchmark itself draws and reads it")
     kind, scene = MARKERS[entrant.marker], draw(EASY, SEED)
     printed = 3 % kind.ids
     seen = entrant.start(scene.surface)(scene.photograph(texture(entrant.marker, printed, size)), scene.camera)

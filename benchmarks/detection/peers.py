@@ -31,6 +31,8 @@ Reader = Callable[[Raster, Camera], list[Seen]]
 CELL_TEXELS = 128
 IDENTITIES = 20
 """Identities drawn from, of each family that has as many."""
+APRILTAG_IDS = 587
+"""How many of an AprilTag family are active: all of tag36h11."""
 FRACTAL = "FRACTAL_3L_6"
 FRACTAL_CELLS = 14
 FRACTAL_SQUARES = {0: 1.0, 1: 3 / 7, 2: 1 / 7}
@@ -149,13 +151,17 @@ def astratag_tracked(surface: Surface | None) -> Reader:
 
 @lru_cache(maxsize=2)
 def apriltag_detector(family: str):
-    """Return an AprilTag detector of one thread, the only one of its family: 48h12 has a table of gigabytes.
+    """Return an AprilTag detector of one thread that corrects two bits, as is usual.
 
-    The binding rounds decode_sharpening down to 0; 0.25 is the library's own.
+    Only the family's first ``APRILTAG_IDS`` are active: with all 42211, the table of 48h12 takes gigabytes.  The
+    binding rounds decode_sharpening down to 0; 0.25 is the library's own.
     """
     from pyapriltags import Detector as AprilTagDetector
 
-    detector = AprilTagDetector(families=family, nthreads=1)
+    detector = AprilTagDetector(families="", nthreads=1)
+    detector.tag_families[family] = codes = getattr(detector.libc, f"{family}_create")()
+    codes.contents.ncodes = APRILTAG_IDS
+    detector.libc.apriltag_detector_add_family_bits(detector.tag_detector_ptr, codes, 2)
     detector.tag_detector_ptr.contents.decode_sharpening = 0.25
     return detector
 
