@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
+from typing import Any
 
 import cv2
 import numpy as np
@@ -150,7 +151,7 @@ def astratag_tracked(surface: Surface | None) -> Reader:
 
 
 @lru_cache(maxsize=2)
-def apriltag_detector(family: str):
+def apriltag_detector(family: str) -> Any:
     """Return an AprilTag detector of one thread that corrects two bits, as is usual.
 
     Only the family's first ``APRILTAG_IDS`` are active: with all 42211, the table of 48h12 takes gigabytes.  The
