@@ -125,7 +125,9 @@ class Camera:
             radial = 1 + rr * (k1 + rr * (k2 + rr * k3))
             x, y = x * radial + p1 * xy2 + p2 * (rr + 2 * xx), y * radial + p1 * (rr + 2 * yy) + p2 * xy2
         (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
-        return np.stack([fx * x + cx, fy * y + cy]).T
+        at = np.empty((2, len(x)))
+        at[0], at[1] = fx * x + cx, fy * y + cy
+        return at.T
 
     def projection_jacobian(self, points_cam: Array) -> Array:
         """Return d pixel / d point (N, 2, 3), px per metre, at points (N, 3) in the camera frame (z > 0)."""

@@ -33,7 +33,8 @@ PULL_PX, PULL_FLOOR_PX = 0.023, 0.005
 """How far a whole edge may be off when its neighbours are as near as ``SHARP_REACH_PX``, and at least."""
 TUKEY = 4.685
 """Residuals beyond this many standard deviations weigh nothing (95 % efficiency on Gaussian noise)."""
-REWEIGHTINGS = 4
+REWEIGHTINGS, SAME_SPREAD = 4, 0.02
+"""Weights are found again until the residuals' spread changes by no more than this fraction."""
 MAX_STEPS, LINEAR_PX = 6, 0.01
 """Gauss-Newton steps end when the last did what its derivative promised, to this many pixels."""
 SHARP_REACH_PX, LEAST_REACH_PX = 4.0, 1.2
@@ -173,7 +174,9 @@ def _robust_least_squares(A: Array, offset: Array, share: Array, common: Array, 
         information = weighted @ A.T + prior
         x = np.linalg.solve(information, weighted @ offset)
         residual = offset - x @ A
-        sigma_px = max(_spread(residual), NOISE_FLOOR_PX)
+        before_px, sigma_px = sigma_px, max(_spread(residual), NOISE_FLOOR_PX)
+        if abs(sigma_px - before_px) <= SAME_SPREAD * before_px:
+            break
         robust = np.square(np.maximum(1 - (residual / (TUKEY * sigma_px)) ** 2, 0))
     return _Solution(x / scale, weight, sigma_px, np.linalg.inv(information) / np.outer(scale, scale))
 
