@@ -16,7 +16,8 @@ import argparse
 import json
 import multiprocessing
 import platform
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
@@ -36,27 +37,32 @@ PARTS = (*(condition.name for condition in CONDITIONS), "cost", "false-accepts")
 CONSOLE = Console(width=160)
 
 
-def recall(conditions: Sequence[Condition], images: int, processes: int, entrants: tuple[Entrant, ...]) -> list[dict]:
-    """Return the rows of all cells, measured by several processes."""
-    cells = [(condition.name, value) for condition in conditions for value in condition.values]
+def recall(
+    conditions: Sequence[Condition], images: int, processes: int, entrants: tuple[Entrant, ...]
+) -> Iterator[tuple[Condition, list[dict]]]:
+    """Yield each condition with its rows as soon as all its cells are measured, by several processes."""
+    names = tuple(entrant.name for entrant in entrants)
+    rows: dict[str, list[dict]] = {condition.name: [] for condition in conditions}
     context = multiprocessing.get_context("spawn")
-    with Progress(*Progress.get_default_columns(), MofNCompleteColumn(), TimeElapsedColumn(), console=CONSOLE) as bar:
-        task = bar.add_task(f"recall, {images} images a cell", total=len(cells))
-        with ProcessPoolExecutor(processes, mp_context=context) as pool:
-            names = tuple(entrant.name for entrant in entrants)
-            jobs = [pool.submit(measure, *cell, images, names) for cell in cells]
-            rows = []
-            for job in as_completed(jobs):
-                rows += job.result()
-                bar.advance(task)
-    return rows
+    with (
+        ProcessPoolExecutor(processes, mp_context=context) as pool,
+        Progress(*Progress.get_default_columns(), MofNCompleteColumn(), TimeElapsedColumn(), console=CONSOLE) as bar,
+    ):
+        jobs = {pool.submit(measure, c.name, value, images, names): c for c in conditions for value in c.values}
+        left = Counter(condition.name for condition in jobs.values())
+        for job in bar.track(as_completed(jobs), len(jobs), description=f"recall, {images} images a cell"):
+            condition = jobs[job]
+            rows[condition.name] += job.result()
+            left[condition.name] -= 1
+            if not left[condition.name]:
+                yield condition, rows[condition.name]
 
 
 def show_condition(condition: Condition, rows: Sequence[dict], entrants: Iterable[Entrant]) -> None:
-    """Print an entrant's per cent found, wrong readings and corner error, a line for each size."""
+    """Print an entrant's per cent found, wrong and misplaced readings and corner error, a line for each size."""
     seeds = sorted({(row["value"], row["first_seed"]) for row in rows if row["condition"] == condition.name})
     table = Table(title=f"{condition.name}: {condition.label}", title_justify="left", box=None)
-    table.add_column("found, % (! n: wrong readings) (corner RMS, px)", no_wrap=True)
+    table.add_column("found, % !wrong ?misplaced (corner RMS, px)", no_wrap=True)
     for value in condition.values:
         table.add_column(f"{value:g}", justify="right", no_wrap=True)
     for size in SIZES:
@@ -72,7 +78,7 @@ def show_condition(condition: Condition, rows: Sequence[dict], entrants: Iterabl
 
 def cell_text(row: dict) -> str:
     """Return one cell of the table."""
-    wrong = f"!{row['wrong']} " if row["wrong"] else ""
+    wrong = (f"!{row['wrong']} " if row["wrong"] else "") + (f"?{row['misplaced']} " if row["misplaced"] else "")
     corner = f" ({row['corner_rms_px']:.2f})" if row["corner_rms_px"] is not None else ""
     return f"{wrong}{100 * row['recall']:.0f}{corner}"
 
@@ -101,6 +107,13 @@ def show_false_accepts(result: dict) -> None:
         CONSOLE.print(f"  {row['entrant']:28} {row['reports']}")
 
 
+def save(results: dict[str, object], folder: Path) -> Path:
+    """Write what there is so far, and return where."""
+    path = folder / "results.json"
+    path.write_text(json.dumps(results, indent=1) + "\n")
+    return path
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.detection", description=__doc__)
     parser.add_argument("--images", type=int, default=50, help="images a cell (50)")
@@ -124,16 +137,16 @@ def main() -> None:
         results["cost"] = cost = measure_cost(options.images, (*entrants, TRACKED))
         show_cost(cost)
         draw_cost(cost, options.out)
-    if conditions:
-        results["recall"] = rows = recall(conditions, options.images, options.processes, entrants)
-        for condition in conditions:
-            show_condition(condition, rows, entrants)
-            draw_condition(condition, rows, options.out)
+    results["recall"] = measured = []
+    for condition, rows in recall(conditions, options.images, options.processes, entrants):
+        show_condition(condition, rows, entrants)
+        draw_condition(condition, rows, options.out)
+        measured += rows
+        save(results, options.out)
     if "false-accepts" in parts:
         results["false_accepts"] = accepts = measure_false_accepts(options.candidates, options.textures, entrants)
         show_false_accepts(accepts)
-    (options.out / "results.json").write_text(json.dumps(results, indent=1) + "\n")
-    CONSOLE.print(f"saved in {options.out}")
+    CONSOLE.print(f"saved in {save(results, options.out)}")
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ def rows_of(rows: Sequence[dict], condition: str, entrant: str, size: str) -> li
 
 
 def draw_condition(condition: Condition, rows: Sequence[dict], folder: Path) -> Path:
-    """Save recall with its 95 % bounds, and corner error, over one condition at both sizes."""
+    """Save recall, with 95 % bounds for AstraTag, and corner error, over one condition at both sizes."""
     figure = Figure(figsize=(12, 7.5), layout="constrained")
     panels = figure.subplots(2, len(SIZES), sharex=True, sharey="row")
     for column, size in enumerate(SIZES):
@@ -43,10 +43,11 @@ def draw_condition(condition: Condition, rows: Sequence[dict], folder: Path) -> 
                 continue
             colour, mark, line = STYLES[entrant.name]
             values = [row["value"] for row in mine]
-            low, high = zip(*[row["recall_95"] for row in mine], strict=True)
             style = {"color": colour, "marker": mark, "linestyle": line, "markersize": 4}
             recall.plot(values, [100 * row["recall"] for row in mine], label=entrant.name, **style)
-            recall.fill_between(values, [100 * x for x in low], [100 * x for x in high], color=colour, alpha=0.08, lw=0)
+            if entrant.marker == "AstraTag":  # bands of all would hide each other
+                low, high = zip(*[[100 * bound for bound in row["recall_95"]] for row in mine], strict=True)
+                recall.fill_between(values, low, high, color=colour, alpha=0.12, lw=0)
             errors = [row["corner_rms_px"] if row["corner_rms_px"] is not None else float("nan") for row in mine]
             corners.plot(values, errors, **style)
         recall.plot(list(condition.asked), list(condition.asked.values()), "k_", label="asked of AstraTag")
@@ -70,7 +71,7 @@ def draw_cost(rows: Sequence[dict], folder: Path) -> Path:
         shown = [name for name in reversed(names) if name in mine]
         bars = axes.barh(shown, [mine[name] for name in shown], color="#999999")
         axes.bar_label(bars, fmt="%.2f", padding=2, fontsize=8)
-        axes.set(title=size, xlabel="CPU ms a frame, one thread", xscale="log")
+        axes.set(title=size, xlabel="CPU ms a frame, one thread")
         axes.margins(x=0.2)
     return save(figure, folder / "cost.png")
 

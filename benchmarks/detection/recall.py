@@ -1,7 +1,7 @@
 """Recall, wrong identities, corner error and CPU time in one cell: one value of one condition.
 
 A reading is right when its identity is and its corners, in their own order, are within ``PLACED`` of the longest edge
-of the truth; anything else a detector reports is wrong.
+of the truth.  With another identity it is wrong; with the right one elsewhere, or turned, misplaced.
 """
 
 from __future__ import annotations
@@ -34,16 +34,18 @@ class Tally:
     images: int = 0
     found: int = 0
     wrong: int = 0
+    misplaced: int = 0
     squared_errors: list[float] = field(default_factory=list)
     cpu_ms: list[float] = field(default_factory=list)
 
     def add(self, seen: list[Seen], truth: dict[int, Array], cpu_ms: float) -> None:
         """Count one picture: ``truth`` holds each right identity's corners in pixels (4, 2)."""
-        errors = [_squared_error(corners, truth.get(identity)) for identity, corners in seen]
+        errors = [_squared_error(corners, truth[identity]) for identity, corners in seen if identity in truth]
         right = [error for error in errors if error is not None]
         self.images += 1
         self.found += bool(right)
-        self.wrong += len(errors) - len(right)
+        self.wrong += len(seen) - len(errors)
+        self.misplaced += len(errors) - len(right)
         self.squared_errors += right[:1]
         self.cpu_ms.append(cpu_ms)
 
@@ -56,15 +58,14 @@ class Tally:
             "recall": self.found / self.images,
             "recall_95": [low, high],
             "wrong": self.wrong,
+            "misplaced": self.misplaced,
             "corner_rms_px": float(np.sqrt(np.mean(self.squared_errors))) if self.squared_errors else None,
             "cpu_ms": float(np.median(self.cpu_ms)),
         }
 
 
-def _squared_error(corners: Array, truth: Array | None) -> float | None:
-    """Return the mean squared distance a coordinate, or None when the corners are nobody's."""
-    if truth is None:
-        return None
+def _squared_error(corners: Array, truth: Array) -> float | None:
+    """Return the mean squared distance a coordinate, or None when the corners are elsewhere."""
     longest = np.linalg.norm(np.roll(truth, -1, axis=0) - truth, axis=1).max()
     away = np.linalg.norm(corners - truth, axis=1)
     return float(np.mean(away**2) / 2) if away.max() <= max(PLACED * longest, PLACED_AT_LEAST_PX) else None
