@@ -45,6 +45,8 @@ SAME_COST, SAME_POSE_RAD = 0.98, 0.02
 NOTICEABLE_BEND = 0.02
 """A print of unknown surface is called curved from this bend on, as a fraction of its side."""
 GRID_LINES = 9
+GRID = np.stack(np.meshgrid(*[np.linspace(0.0, TEMPLATE_UNITS, GRID_LINES)] * 2), axis=-1)
+"""The print's regular grid (9, 9, 2), template units, rows from the top."""
 
 
 SQUARES = np.array([square(*layer.black) for layer in LAYERS])
@@ -292,8 +294,7 @@ def as_gray(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 def warp_grid(warp: FittedWarp) -> Array:
     """Return the print's regular grid (9, 9, 2) in the image, rows from the top."""
-    span = np.linspace(0.0, TEMPLATE_UNITS, GRID_LINES)
-    return warp(np.stack(np.meshgrid(span, span), axis=-1))
+    return warp(GRID)
 
 
 def _corner_rms(warp: PoseWarp, layers: Sequence[LayerDetection]) -> float:

@@ -77,7 +77,8 @@ _TO_PAPER = np.where(EDGE_IS_FRAME, -1.0, 1.0)[:, None]
 EDGE_REACH = np.array([e.reach for e in EDGES])
 _FEW = np.array([0, POINTS_PER_EDGE // 2, POINTS_PER_EDGE - 1])
 _OUTWARDS = np.array([(0.0, -1.0), (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0)])[[e.side for e in EDGES]][:, None, :]
-_PROBES = np.concatenate([EDGE_POINTS, EDGE_POINTS[:, _FEW] - _OUTWARDS], axis=1)
+_FEW_POINTS = EDGE_POINTS[:, _FEW]
+_PROBES = np.concatenate([EDGE_POINTS, _FEW_POINTS - _OUTWARDS], axis=1)
 """The points of each edge, and a few of them one unit further in."""
 LEAST_RISE, LEAST_RISE_GREY = 0.35, 0.05
 """How steep a rise must be: a fraction of what is typical of its own edge, and in linear grey values a pixel."""
@@ -137,7 +138,7 @@ def locate(light: NDArray[np.float32], warp: FittedWarp, edges: NDArray[np.int64
     # how far apart neighbouring edges look, where that is least: small when the print is seen at a slant
     across = (inwards - predicted[:, _FEW]) * normal[:, _FEW]
     reach_px = EDGE_REACH[edges] * np.abs(across.sum(axis=2)).min(axis=1)
-    visible = warp.visible(EDGE_POINTS[edges][:, _FEW].reshape(-1, 2)).reshape(-1, len(_FEW)).all(axis=1)
+    visible = warp.visible(_FEW_POINTS[edges].reshape(-1, 2)).reshape(-1, len(_FEW)).all(axis=1)
 
     half = int(np.ceil((search_px + 3 * SMOOTHING_PX) / STEP_PX))
     in_view: Mask = _inside(predicted, half * STEP_PX * normal, light.shape) & np.asarray(visible)[:, None]

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from astratag.camera import Camera
 from astratag.detection import LayerDetection, PlanarPose
-from astratag.geometry import LAYERS, print_from_template, square
+from astratag.geometry import LAYERS, square
 from astratag.surface import Surface
 from astratag.transforms import pose, transform
-from astratag.warp import PoseWarp
+from astratag.warp import PoseWarp, on_surface
 
 Array = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ def poses_from_square(
     surface the plane is the one through its corners.
     Collins and Bartoli, "Infinitesimal plane-based pose estimation", IJCV 2014.
     """
-    points_marker = surface.points(print_from_template(template, side_m))
+    points_marker = on_surface(surface, side_m, template)[0].T
     behind_m = points_marker[:, 2].mean()
     in_plane = points_marker * (1.0, 1.0, 0.0)
     rays = camera.undistort(corners_px)
@@ -78,7 +78,7 @@ def planar_poses(
     starts = poses_from_square(camera, _SQUARES[largest.layer], largest.corners_px, side_m, surface)
     template, corners_px = np.concatenate([_SQUARES[seen.layer] for seen in layers]), _corners(layers)
 
-    points_marker = surface.points(print_from_template(template, side_m))
+    points_marker = np.ascontiguousarray(on_surface(surface, side_m, template)[0].T)
     rms_px = _reprojection_rms(camera, starts, points_marker, corners_px)
     hopeless_px = max(HOPELESS_RMS_PX, HOPELESS_RATIO * min(rms_px, default=0.0))
     poses = [

@@ -157,12 +157,16 @@ class BentWarp:
         return warp
 
 
+def on_surface(surface: Surface, side_m: float, template: Array) -> tuple[Array, Array]:
+    """Return the points and outward normals (3, N) in the marker frame of template points (..., 2); not to be changed.
+
+    They are kept, because the same few sets of points are projected in every frame.
+    """
+    return _on_surface(surface, side_m, np.asarray(template, dtype=float).tobytes())
+
+
 @lru_cache(maxsize=64)
 def _on_surface(surface: Surface, side_m: float, template: bytes) -> tuple[Array, Array]:
-    """Return the points and outward normals (3, N) in the marker frame of template points (N, 2), given as bytes.
-
-    Kept, because the same few sets of points are projected in every frame.
-    """
     on_print = print_from_template(np.frombuffer(template).reshape(-1, 2), side_m)
     points, normals = (np.ascontiguousarray(of(on_print).T) for of in (surface.points, surface.normals))
     points.flags.writeable = normals.flags.writeable = False
@@ -180,7 +184,7 @@ class PoseWarp:
 
     def _marker(self, template: Array) -> tuple[Array, Array]:
         """Return points and outward normals (3, N) in the marker frame."""
-        return _on_surface(self.surface, self.side_m, np.asarray(template, dtype=float).tobytes())
+        return on_surface(self.surface, self.side_m, template)
 
     def _cam(self, points_marker: Array) -> Array:
         """Return points (3, N) of the marker frame in the camera's."""
