@@ -34,7 +34,7 @@ from benchmarks.detection.scenes import CONDITIONS, Condition
 
 REAL_FRAMES = Path(__file__).resolve().parents[3] / "shared" / "reference" / "frames"
 PARTS = (*(condition.name for condition in CONDITIONS), "cost", "false-accepts")
-CONSOLE = Console(width=160)
+CONSOLE = Console(width=200)
 
 
 def recall(
