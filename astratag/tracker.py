@@ -14,7 +14,7 @@ from astratag.detection import Detection
 from astratag.detector import HALVE_FROM_PX, Detector, View, surest
 from astratag.fit import fit_edges
 from astratag.grow import ALL_EDGES, SETTLED_PX, Fit, grow, settle
-from astratag.search import find_quads
+from astratag.search import COARSE, PLAIN, find_outlines
 from astratag.surface import Flat
 from astratag.transforms import difference, perturb
 from astratag.warp import FittedWarp, HomographyWarp, PoseWarp
@@ -139,7 +139,9 @@ class Tracker:
         view = self.detector.view(view.gray, view.camera, [box])
         (left, top), (right, bottom) = box
         part = view.gray[top:bottom, left:right]
-        found, _ = self.detector.search(view, find_quads(part, halve=part.size > HALVE_FROM_PX) + box[0])
+        found = self.detector.search(
+            view, find_outlines(part, COARSE if part.size > HALVE_FROM_PX else PLAIN).moved(box[0])
+        )
         return next((seen for seen in found if seen.marker_id == track.marker_id), None)
 
 
