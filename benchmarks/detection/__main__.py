@@ -41,6 +41,8 @@ def recall(
     conditions: Sequence[Condition], images: int, processes: int, entrants: tuple[Entrant, ...]
 ) -> Iterator[tuple[Condition, list[dict]]]:
     """Yield each condition with its rows as soon as all its cells are measured, by several processes."""
+    if not conditions:
+        return
     names = tuple(entrant.name for entrant in entrants)
     rows: dict[str, list[dict]] = {condition.name: [] for condition in conditions}
     context = multiprocessing.get_context("spawn")
