@@ -45,6 +45,8 @@ ACCEPT_OF_LOOKS = 0.82
 """Correlation from which a square is believed whose edges cannot be measured; blurred codes are more alike."""
 MOST_WRONG = 9
 """Cells of such a square that may be on the wrong side of half way."""
+CLEARLY_THAT_LAYER = 0.08
+"""How much better such a square must look as one layer than as any other: a wrong one makes the range wrong."""
 LOOKS_SIGMA_PX, LOOKS_SIGMA = 0.3, 0.01
 """Standard deviation of corners that were aligned, not measured: in pixels, and more as a fraction of a bent side."""
 AMBIGUOUS_RATIO, AMBIGUOUS_RMS_PX = 4.0, 0.05
@@ -214,6 +216,8 @@ class Detector:
         layer = int(scores.argmax())
         reading = candidate.reading
         if scores[layer] < LEAST_LOOKS or reading.correlation < ACCEPT_OF_LOOKS or reading.hamming > MOST_WRONG:
+            return None
+        if scores[layer] - np.delete(scores, layer).max() < CLEARLY_THAT_LAYER:
             return None
         flat = replace(candidate, bent=False)  # a bend does not carry from an inner layer to the whole print
         warp = self._whole_print(candidate if layer == 0 else flat, layer)
