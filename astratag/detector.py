@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -21,7 +22,7 @@ from astratag.detection import Detection, LayerDetection, PlanarPose
 from astratag.dictionary import Dictionary, load_dictionary
 from astratag.edges import Transfer, inverse_transfer
 from astratag.fit import measure_layers
-from astratag.geometry import LAYERS, TEMPLATE_UNITS, layer_points, square
+from astratag.geometry import LAYERS, TEMPLATE_UNITS, Layer, layer_points, square
 from astratag.grow import Fit, fit_own_edges, grow, layer_side_px, settle
 from astratag.pose import planar_poses, poses_from_square, refine_on_corners
 from astratag.search import COARSE, FAINT, NARROW, PLAIN, Outlines, bent_quads_of, find_outlines, quads_of
@@ -39,14 +40,21 @@ LEAST_LIKENESS = 0.45
 """Correlation of the whole print with what is seen through a fit, below which it is something else."""
 CERTAIN_LIKENESS = 0.75
 """Likeness from which no other layer is tried."""
-LEAST_LOOKS = 0.7
-"""Correlation of a square and its surroundings with what it reads, without which its edges must agree."""
-ACCEPT_OF_LOOKS = 0.82
-"""Correlation from which a square is believed whose edges cannot be measured; blurred codes are more alike."""
-MOST_WRONG = 9
-"""Cells of such a square that may be on the wrong side of half way."""
-CLEARLY_THAT_LAYER = 0.08
+LEAST_LOOKS = (0.72, 0.72, 0.85)
+"""Correlation of a square and its surroundings with what it reads, by layer, without which its edges must agree.
+
+More of the innermost, which has no other inside it to tell it by.
+"""
+ACCEPT_OF_LOOKS, SURE_LOOKS = 0.82, 0.88
+"""Correlation from which a square is believed whose edges cannot be measured: with few wrong cells, with more."""
+FEW_WRONG, MOST_WRONG = 8, 9
+"""Cells of such a square that may be on the wrong side of half way; blur alone puts some there."""
+CLEARLY_THAT_LAYER = 0.12
 """How much better such a square must look as one layer than as any other: a wrong one makes the range wrong."""
+LIKELY_THAT_LAYER, LIKELY_LOOKS = 0.05, 0.5
+"""The same where its edges agree too, of the clearest layer measured; and how well that layer must look."""
+MOVED_PX, MOVED = 4.0, 0.1
+"""How far an alignment may move corners: pixels, or a fraction of the square's side if that is more."""
 LOOKS_SIGMA_PX, LOOKS_SIGMA = 0.3, 0.01
 """Standard deviation of corners that were aligned, not measured: in pixels, and more as a fraction of a bent side."""
 AMBIGUOUS_RATIO, AMBIGUOUS_RMS_PX = 4.0, 0.05
@@ -207,6 +215,8 @@ class Detector:
             if candidate.bent or candidate.reading.correlation < ACCEPT_OF_LOOKS:
                 return None
             sure = candidate
+        if np.abs(sure.corners_px - candidate.corners_px).max() > max(MOVED_PX, MOVED * candidate.side_px):
+            return None
         return self._confirm_edges(view, sure) or self._confirm_looks(view, sure)
 
     def _confirm_looks(self, view: View, candidate: Candidate) -> Detection | None:
@@ -215,9 +225,10 @@ class Detector:
         scores = self._artwork.layer_scores(view.gray, candidate.warp, marker_id, candidate.side_px)
         layer = int(scores.argmax())
         reading = candidate.reading
-        if scores[layer] < LEAST_LOOKS or reading.correlation < ACCEPT_OF_LOOKS or reading.hamming > MOST_WRONG:
+        least = ACCEPT_OF_LOOKS if reading.hamming <= FEW_WRONG else SURE_LOOKS
+        if reading.correlation < least or reading.hamming > MOST_WRONG:
             return None
-        if scores[layer] - np.delete(scores, layer).max() < CLEARLY_THAT_LAYER:
+        if scores[layer] < LEAST_LOOKS[layer] or _lead(scores, layer) < CLEARLY_THAT_LAYER:
             return None
         flat = replace(candidate, bent=False)  # a bend does not carry from an inner layer to the whole print
         warp = self._whole_print(candidate if layer == 0 else flat, layer)
@@ -249,9 +260,20 @@ class Detector:
         else:
             method = "tps" if candidate.bent or _bend_fraction(fit.warp) > NOTICEABLE_BEND else "planar"
         detection = self.describe(view, marker_id, fit, method)
-        if detection is None or not detection.layers:
+        if detection is None or not self._layers_agree(view, detection, fit.warp):
             return None
         return self._with_other_pose(view, detection, fit)
+
+    def _layers_agree(self, view: View, detection: Detection, warp: FittedWarp) -> bool:
+        """Return whether a measured layer looks like itself and not like another, which may have the same edges."""
+        for seen in detection.layers:
+            layer = LAYERS[seen.layer]
+            side_px = layer_side_px(warp, seen.layer)
+            inside = partial(_inside_layer, warp, layer)
+            scores = self._artwork.layer_scores(view.gray, inside, detection.marker_id, side_px)
+            if scores[seen.layer] >= LIKELY_LOOKS and _lead(scores, seen.layer) >= LIKELY_THAT_LAYER:
+                return True
+        return False
 
     def _whole_print(self, candidate: Candidate, layer: int) -> HomographyWarp | BentWarp:
         """Return the warp of the whole print when the candidate is ``layer`` of it."""
@@ -374,6 +396,16 @@ def moved_onto(warp: PoseWarp, template: Array, points_px: Array) -> PoseWarp:
         delta = np.linalg.lstsq(damped, np.append(left, np.zeros(6)), rcond=None)[0]
         warp = warp.stepped(delta / scale)
     return warp
+
+
+def _inside_layer(warp: FittedWarp, layer: Layer, points: Array) -> Array:
+    """Return the pixels of points (..., 2) given as if ``layer`` were the outermost square."""
+    return warp(layer_points(points, layer))
+
+
+def _lead(scores: Array, layer: int) -> float:
+    """Return how much better one layer's score (3,) is than the best of the others."""
+    return float(scores[layer] - np.delete(scores, layer).max())
 
 
 def _sure(found: Sequence[Detection]) -> bool:
