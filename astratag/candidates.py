@@ -32,14 +32,14 @@ PROMISING = 0.5
 PROMISING_SMALL = 0.6
 """The same of a square so small that its code is blurred: blurred codes are more alike, and like more."""
 MAX_CANDIDATES = 10
-HOPELESS = 0.45
+HOPELESS = 0.5
 """Correlation after a coarse alignment below which a fine one is not tried."""
 SURE = 0.85
 """Correlation from which a reading needs no second opinion."""
 PROMISING_BENT = 0.55
 """Correlation through the best of some forty shifts from which a bent square is worth aligning."""
-MAX_BENT = 4
-MAX_BENT_READ = 20
+MAX_BENT = 3
+MAX_BENT_READ = 16
 LEAST_BENT_SIDE_PX = 16.0
 LEAST_STEP_GREY = 4.0
 """How much brighter the surroundings of a square must be than its border, on average."""
@@ -153,8 +153,8 @@ def bent_candidates(gray: Image, quads: BentQuads, codebook: Codebook) -> list[C
         return []
     framed = _framed_bent(gray, shapes)
     read = zip(*(part[framed][:MAX_BENT_READ] for part in shapes), strict=True)
-    found = [_bent(gray, corners_px, bulges_px, codebook) for corners_px, bulges_px in read]
-    promising = [candidate for candidate in found if candidate.reading.correlation >= PROMISING_BENT]
+    found = (_bent(gray, corners_px, bulges_px, codebook) for corners_px, bulges_px in read)
+    promising = [candidate for candidate in found if candidate is not None]
     return sorted(promising, key=lambda c: -c.reading.correlation)[:MAX_BENT]
 
 
@@ -166,8 +166,8 @@ def _framed_bent(gray: Image, shapes: BentQuads) -> NDArray[np.bool_]:
     return (values[:, 0] - values[:, 1] >= LEAST_STEP_GREY).sum(axis=1) >= 3
 
 
-def _bent(gray: Image, corners_px: Array, bulges_px: Array, codebook: Codebook) -> Candidate:
-    """Return what one bent shape reads through the best of all shifts along its sides."""
+def _bent(gray: Image, corners_px: Array, bulges_px: Array, codebook: Codebook) -> Candidate | None:
+    """Return what one bent shape reads through the best of all shifts along its sides, None when hopeless."""
     right = (corners_px[1] - corners_px[0] + corners_px[2] - corners_px[3]) / 2
     down = (corners_px[3] - corners_px[0] + corners_px[2] - corners_px[1]) / 2
     by_side, rows, columns = _BENT_SAMPLES
@@ -175,6 +175,8 @@ def _bent(gray: Image, corners_px: Array, bulges_px: Array, codebook: Codebook) 
     along = _SHIFTS[:, 0, None, None] * (rows[:, None] * right) + _SHIFTS[:, 1, None, None] * (columns[:, None] * down)
     readings = codebook.read(cell_values(gray, (base + along).astype(np.float32)))
     best = max(range(len(readings)), key=lambda i: readings[i].correlation)
+    if readings[best].correlation < PROMISING_BENT:
+        return None
     by_side, rows, columns = _BENT_KNOTS
     shift = _SHIFTS[best]
     knots_px = points_in(corners_px[None], KNOTS)[0] + by_side @ bulges_px

@@ -65,7 +65,7 @@ NOTICEABLE_BEND = 0.02
 GRID_LINES = 9
 GRID = np.stack(np.meshgrid(*[np.linspace(0.0, TEMPLATE_UNITS, GRID_LINES)] * 2), axis=-1)
 """The print's regular grid (9, 9, 2), template units, rows from the top."""
-MAX_ALIGNED = 4
+MAX_ALIGNED = 3
 """Candidates moved until they look as they read, in one search."""
 MOVES, DAMPING = 8, 0.03
 """Damped Gauss-Newton steps from the plane through a bent square's corners onto the square."""
