@@ -230,6 +230,8 @@ class Detector:
             return None
         if scores[layer] < LEAST_LOOKS[layer] or _lead(scores, layer) < CLEARLY_THAT_LAYER:
             return None
+        if candidate.bent and layer == len(LAYERS) - 1:
+            return None  # nothing inside fixes its bend, and the whole print is over five times as large
         flat = replace(candidate, bent=False)  # a bend does not carry from an inner layer to the whole print
         warp = self._whole_print(candidate if layer == 0 else flat, layer)
         sigma_px = LOOKS_SIGMA_PX + LOOKS_SIGMA * candidate.side_px * candidate.bent
