@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.geometry import TEMPLATE_UNITS
+from astratag.geometry import TEMPLATE_UNITS, square
 from astratag.signature import sample
-from astratag.warp import BentWarp
+from astratag.warp import FittedWarp
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
+W = TypeVar("W", bound=FittedWarp)
 
 COARSE_BLUR, COARSE_STEPS = 0.03, 4
 """Blur, as a fraction of the print's side in the image, at which a warp some cells off still finds its way."""
@@ -21,7 +24,7 @@ TUKEY = 4.685
 _CROSS = np.array([(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])[:, None, :]
 
 
-def align(gray: Image, warp: BentWarp, points: Array, expected: Array, *, blur: float, steps: int) -> BentWarp:
+def align(gray: Image, warp: W, points: Array, expected: Array, *, blur: float, steps: int) -> W:
     """Return ``warp`` moved so that the image at its ``points`` (N, 2) looks like ``expected`` (N,).
 
     The light may vary: brightness is a quadratic surface over the print, contrast a linear one.  Gauss-Newton
@@ -30,14 +33,20 @@ def align(gray: Image, warp: BentWarp, points: Array, expected: Array, *, blur: 
     """
     u, v = (points / (TEMPLATE_UNITS / 2) - 1.0).T
     light = np.stack([u**0, u, v, u * v, u * u, v * v, expected, expected * u, expected * v], axis=1)
-    low, high = warp(points).min(axis=0), warp(points).max(axis=0)
-    side_px = float((high - low).max())
-    corner = np.maximum(np.floor(low - 0.2 * side_px), 0).astype(int)
-    end = np.ceil(high + 0.2 * side_px).astype(int) + 1
-    part = gray[corner[1] : end[1], corner[0] : end[0]]
-    if min(part.shape) < 8 or not np.isfinite(side_px):
+    outline = warp(square(0.0, TEMPLATE_UNITS))
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    span_px = float((high - low).max())
+    diagonals = outline[2] - outline[0], outline[3] - outline[1]
+    side_px = np.sqrt(abs(diagonals[0][0] * diagonals[1][1] - diagonals[0][1] * diagonals[1][0]) / 2)
+    if not np.isfinite(span_px):
         return warp
-    smooth = cv2.GaussianBlur(part, (0, 0), blur * side_px) if blur * side_px > LEAST_BLUR_PX else part
+    corner = np.clip(np.floor(low - 0.2 * span_px), 0, gray.shape[::-1]).astype(int)
+    end = np.clip(np.ceil(high + 0.2 * span_px) + 1, 0, gray.shape[::-1]).astype(int)
+    part = gray[corner[1] : end[1], corner[0] : end[0]]
+    if min(part.shape) < 8:
+        return warp
+    width = 2 * round(np.sqrt(3.0) * blur * side_px) + 1  # of a box as wide as a Gaussian of that deviation
+    smooth = cv2.blur(part, (width, width)) if blur * side_px > LEAST_BLUR_PX else part
     for _ in range(steps):
         at = warp(points) - corner
         inside = ((at >= 1) & (at <= np.array(smooth.shape[::-1]) - 2)).all(axis=1)

@@ -116,25 +116,43 @@ class Camera:
 
     def project(self, points_cam: Array) -> Array:
         """Return pixels (N, 2) of points (N, 3) in the camera frame, which must lie in front of it (z > 0)."""
-        points = np.ascontiguousarray(points_cam, dtype=float).reshape(-1, 3)
-        if not (self.distortion.any() and len(points)):
-            return (points[:, :2] / points[:, 2:]) @ self.K[:2, :2].T + self.K[:2, 2]
-        zero = np.zeros(3)
-        return cv2.projectPoints(points.reshape(-1, 1, 3), zero, zero, self.K, self.distortion)[0].reshape(-1, 2)
+        X, Y, Z = np.asarray(points_cam, dtype=float).reshape(-1, 3).T
+        x, y = X / Z, Y / Z
+        if self.distortion.any():
+            k1, k2, p1, p2, k3 = self.distortion.tolist()
+            xx, yy, xy2 = x * x, y * y, 2 * x * y
+            rr = xx + yy
+            radial = 1 + rr * (k1 + rr * (k2 + rr * k3))
+            x, y = x * radial + p1 * xy2 + p2 * (rr + 2 * xx), y * radial + p1 * (rr + 2 * yy) + p2 * xy2
+        (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
+        at = np.empty((2, len(x)))
+        at[0], at[1] = fx * x + cx, fy * y + cy
+        return at.T
 
     def projection_jacobian(self, points_cam: Array) -> Array:
         """Return d pixel / d point (N, 2, 3), px per metre, at points (N, 3) in the camera frame (z > 0)."""
-        points = np.asarray(points_cam, dtype=float).reshape(-1, 3)
-        if self.distortion.any():
-            zero = np.zeros(3)
-            by_all = cv2.projectPoints(points.reshape(-1, 1, 3), zero, zero, self.K, self.distortion)[1]
-            return by_all[:, 3:6].reshape(-1, 2, 3)  # a shift of the point is a shift of OpenCV's translation
-        x, y, z = points.T
-        z = np.maximum(z, 1e-9)
-        J = np.zeros((len(points), 2, 3))
-        J[:, 0] = np.stack([self.K[0, 0] / z, self.K[0, 1] / z, -(self.K[0, 0] * x + self.K[0, 1] * y) / z**2], axis=1)
-        J[:, 1] = np.stack([np.zeros_like(z), self.K[1, 1] / z, -self.K[1, 1] * y / z**2], axis=1)
-        return J
+        X, Y, Z = np.asarray(points_cam, dtype=float).reshape(-1, 3).T
+        inverse_z = 1 / np.maximum(Z, 1e-9)
+        x, y = X * inverse_z, Y * inverse_z
+        (fx, _, _), (_, fy, _), _ = self.K.tolist()
+        J = np.zeros((2, 3, len(X)))
+        if self.distortion.any():  # Brown, "Close-range camera calibration", 1971, differentiated
+            k1, k2, p1, p2, k3 = self.distortion.tolist()
+            rr = x * x + y * y
+            radial = 1 + rr * (k1 + rr * (k2 + rr * k3))
+            slope = 2 * (k1 + rr * (2 * k2 + rr * (3 * k3)))  # d radial / d r, over r
+            mixed = x * y * slope + 2 * (p1 * x + p2 * y)
+            J[0, 0] = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
+            J[0, 1] = J[1, 0] = mixed
+            J[1, 1] = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
+            J[:, 2] = -(J[:, 0] * x + J[:, 1] * y)
+        else:
+            J[0, 0] = J[1, 1] = 1.0
+            J[0, 2], J[1, 2] = -x, -y
+        J *= inverse_z
+        J[0] *= fx
+        J[1] *= fy
+        return J.transpose(2, 0, 1)
 
     def undistort(self, points_px: Array) -> Array:
         """Return where pixels (N, 2) would be without distortion, in normalised coordinates x/z, y/z (N, 2)."""

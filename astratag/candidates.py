@@ -1,17 +1,27 @@
-"""Candidates: what rough quads read, as if flat, and bent through thin-plate splines where that fails."""
+"""Candidates: what rough quads read, as if flat, and bent where that fails; each moved until it looks as it reads."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from astratag.align import COARSE_BLUR, COARSE_STEPS, FINE_STEPS, align
 from astratag.geometry import TEMPLATE_UNITS, square
-from astratag.signature import ACCEPT_OF_MANY_WARPS, SAMPLES, Artwork, Codebook, Reading, Warp, cell_values
-from astratag.tps import KNOTS, ThinPlate, ThinPlateWarp, bent_places
+from astratag.search import BentQuads
+from astratag.signature import (
+    ACCEPT_OF_MANY_WARPS,
+    SAMPLES,
+    Artwork,
+    Codebook,
+    Reading,
+    Warp,
+    blur_level,
+    cell_values,
+    sample,
+)
+from astratag.tps import KNOTS
 from astratag.warp import BentWarp, HomographyWarp
 
 Array = NDArray[np.float64]
@@ -19,48 +29,81 @@ Image = NDArray[np.uint8]
 
 PROMISING = 0.5
 """Correlation through a rough quad from which a candidate is worth fitting."""
-MAX_CANDIDATES = 12
-FAINT = 0.25
-"""Correlation as if flat from which a quad is worth bending."""
-HOPELESS = 0.4
+PROMISING_SMALL = 0.6
+"""The same of a square so small that its code is blurred: blurred codes are more alike, and like more."""
+MAX_CANDIDATES = 10
+HOPELESS = 0.5
 """Correlation after a coarse alignment below which a fine one is not tried."""
 SURE = 0.85
 """Correlation from which a reading needs no second opinion."""
-MAX_FAINT = 24
+PROMISING_BENT = 0.55
+"""Correlation through the best of some forty shifts from which a bent square is worth aligning."""
 MAX_BENT = 3
-LEAST_BENT_SIDE_PX = 24.0
+MAX_BENT_READ = 16
+LEAST_BENT_SIDE_PX = 16.0
+LEAST_STEP_GREY = 4.0
+"""How much brighter the surroundings of a square must be than its border, on average."""
 OUTER = square(0.0, TEMPLATE_UNITS)
-
-_PLATE = ThinPlate(KNOTS)
-_BENT_SAMPLES = _PLATE.basis(SAMPLES)
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
     """A square that may be a layer of a marker: what it reads, and its corners (4, 2) in the marker's order.
 
-    ``warp`` is what it was read through, taking the whole template onto the square.
+    ``warp`` is what it was read through, taking the whole template onto the square.  ``aligned`` says that it was
+    moved until the square looks as it reads.
     """
 
     reading: Reading
     corners_px: Array
     warp: Warp
     bent: bool = False
+    aligned: bool = False
+
+    @property
+    def side_px(self) -> float:
+        """Return how large the square looks: the root of its area."""
+        return float(looks_large(self.corners_px[None])[0])
 
 
-def flat_candidates(gray: Image, quads: Array, codebook: Codebook) -> tuple[list[Candidate], list[Candidate]]:
-    """Return the quads (Q, 4, 2) that read something like a code, and those that do only faintly, the best first."""
+def looks_large(quads: Array) -> Array:
+    """Return the roots of the areas (Q,) of quads (Q, 4, 2)."""
+    diagonals = quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1]
+    return np.sqrt(np.abs(diagonals[0][:, 0] * diagonals[1][:, 1] - diagonals[0][:, 1] * diagonals[1][:, 0]) / 2)
+
+
+def flat_candidates(gray: Image, quads: Array, codebook: Codebook) -> list[Candidate]:
+    """Return the quads (Q, 4, 2) that read something like a code, the best first."""
+    quads = quads[_framed(gray, quads)] if len(quads) else quads
     if len(quads) == 0:
-        return [], []
-    readings = codebook.read(cell_values(gray, _samples_in(quads)))
-    ranked = sorted(zip(readings, quads, strict=True), key=lambda pair: -pair[0].correlation)
-    promising = [_turned(*pair) for pair in ranked if pair[0].correlation >= PROMISING]
-    faint = [_turned(*pair) for pair in ranked[:MAX_FAINT] if FAINT <= pair[0].correlation < PROMISING]
-    return promising[:MAX_CANDIDATES], faint
+        return []
+    sides_px = looks_large(quads)
+    readings = codebook.read(cell_values(gray, points_in(quads, SAMPLES)), sides_px)
+    least = np.where(blur_level(sides_px) > 0, PROMISING_SMALL, PROMISING)
+    promising = [pair for *pair, bar in zip(readings, quads, least, strict=True) if pair[0].correlation >= bar]
+    return [_turned(*pair) for pair in sorted(promising, key=lambda pair: -pair[0].correlation)[:MAX_CANDIDATES]]
 
 
-def _samples_in(quads: Array) -> NDArray[np.float32]:
-    """Return where the cells' sampling points lie (Q, S, 2) when each quad (Q, 4, 2) is the outer square.
+def _framed(gray: Image, quads: Array) -> NDArray[np.bool_]:
+    """Return which quads (Q, 4, 2) are darker inside their edges than outside, on at least three sides."""
+    values = sample(gray, points_in(quads, _FRAME)).reshape(len(quads), 2, 4, -1).mean(axis=3)
+    return (values[:, 0] - values[:, 1] >= LEAST_STEP_GREY).sum(axis=1) >= 3
+
+
+def _frame_points() -> Array:
+    """Return points outside and inside each side of the template's square (2 x 4 x 5, 2)."""
+    along = np.linspace(0.1, 0.9, 5)
+    across = np.array([-0.06, 0.035])[:, None] * np.ones(5)
+    top = np.stack([np.broadcast_to(along, across.shape), across], axis=2)
+    sides = [top, top[..., ::-1] * (-1, 1) + (1, 0), top * (1, -1) + (0, 1), top[..., ::-1]]
+    return np.stack(sides, axis=1).reshape(-1, 2) * TEMPLATE_UNITS
+
+
+_FRAME = _frame_points()
+
+
+def points_in(quads: Array, template: Array) -> NDArray[np.float32]:
+    """Return where template points (S, 2) lie (Q, S, 2) when each quad (Q, 4, 2) is the outer square.
 
     The projective map of the unit square onto four points in closed form: Heckbert, "Fundamentals of texture
     mapping and image warping", 1989.
@@ -73,7 +116,7 @@ def _samples_in(quads: Array) -> NDArray[np.float32]:
     h = ((d1[:, 0] * total[:, 1] - d1[:, 1] * total[:, 0]) / area)[:, None]
     across, down = p1 - p0 + g * p1, p3 - p0 + h * p3
     rows = np.stack([np.column_stack([across, g]), np.column_stack([down, h]), np.insert(p0, 2, 1.0, axis=1)], axis=2)
-    u, v = (SAMPLES / TEMPLATE_UNITS).T.astype(np.float32)
+    u, v = (template / TEMPLATE_UNITS).T.astype(np.float32)
     x, y, depth = (a * u + b * v + c for a, b, c in rows.astype(np.float32).transpose(1, 2, 0)[..., None])
     return np.stack([x, y], axis=2) / np.maximum(depth, np.float32(1e-6))[:, :, None]
 
@@ -84,49 +127,80 @@ def _turned(reading: Reading, quad: Array) -> Candidate:
     return Candidate(reading, corners_px, HomographyWarp.from_points(OUTER, corners_px))
 
 
-def bent_candidates(gray: Image, faint: Sequence[Candidate], codebook: Codebook, artwork: Artwork) -> list[Candidate]:
-    """Return those of the faint candidates that read well once bent and aligned, the best first."""
-    large = [candidate for candidate in faint if _side_px(candidate) >= LEAST_BENT_SIDE_PX]
-    found = [_bend(gray, candidate, codebook, artwork) for candidate in large[:MAX_BENT]]
-    return sorted((c for c in found if c is not None), key=lambda c: -c.reading.correlation)
+TANGENTIAL = (-0.32, -0.24, -0.16, -0.08, 0.0, 0.08, 0.16, 0.24, 0.32)
+"""How far the middle of a bent print may lie along it from where it would if flat, as fractions of its sides."""
 
 
-def _side_px(candidate: Candidate) -> float:
-    """Return the mean length of a candidate's sides."""
-    corners = candidate.corners_px
-    return float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
+def _profiles(template: Array) -> tuple[Array, Array, Array]:
+    """Return the shares (S, 4) of points (S, 2) in the bulges of four sides, and (S,) in shifts right and down.
 
-
-def _bend(gray: Image, candidate: Candidate, codebook: Codebook, artwork: Artwork) -> Candidate | None:
-    """Return a faint candidate read through a warp that bends, None when that reads no better than chance.
-
-    It is tried as it is and through the thin-plate spline that reads best, each aligned with the artwork of
-    the code it is taken for.
+    The Coons patch whose corners stay in place: sides bulge as parabolas, and shifts along them fall to 0 at the ends.
     """
-    best: Candidate | None = None
-    for start in (candidate, _through_splines(gray, candidate, codebook)):
-        marker_id = start.reading.marker_id
-        expected = artwork.expected(marker_id)[0]
-        warp = BentWarp.from_points(KNOTS, start.warp(KNOTS))
-        for blur, steps, least in ((COARSE_BLUR, COARSE_STEPS, HOPELESS), (0.0, FINE_STEPS, ACCEPT_OF_MANY_WARPS)):
-            warp = align(gray, warp, artwork.points, expected, blur=blur, steps=steps)
-            reading = codebook.read_as(cell_values(gray, warp(SAMPLES)[None])[0], marker_id)
-            if reading.correlation < least:
-                break
-        else:
-            if best is None or reading.correlation > best.reading.correlation:
-                best = Candidate(reading, warp(OUTER), warp, bent=True)
-        if best is not None and best.reading.correlation > SURE:
-            break
-    return best
+    u, v = (template / (TEMPLATE_UNITS / 2) - 1.0).T
+    rows, columns = 1 - u**2, 1 - v**2
+    shares = np.stack([rows * (1 - v) / 2, columns * (1 + u) / 2, rows * (1 + v) / 2, columns * (1 - u) / 2], axis=1)
+    return shares, rows, columns
 
 
-def _through_splines(gray: Image, candidate: Candidate, codebook: Codebook) -> Candidate:
-    """Return what a quad reads through the best of all thin-plate splines."""
-    corners = candidate.corners_px
-    places = bent_places(candidate.warp(KNOTS), corners)
-    readings = codebook.read(cell_values(gray, _BENT_SAMPLES @ places))
+_SHIFTS = np.array([(a, b) for a in TANGENTIAL for b in TANGENTIAL if abs(a) + abs(b) < 0.34])
+
+
+def bent_candidates(gray: Image, quads: BentQuads, codebook: Codebook) -> list[Candidate]:
+    """Return what shapes with bulging sides read through the best of all shifts along these, the best first."""
+    large = looks_large(quads.corners_px) >= LEAST_BENT_SIDE_PX if len(quads.corners_px) else np.zeros(0, dtype=bool)
+    shapes = BentQuads(quads.corners_px[large], quads.bulges_px[large])
+    if len(shapes.corners_px) == 0:
+        return []
+    framed = _framed_bent(gray, shapes)
+    read = zip(*(part[framed][:MAX_BENT_READ] for part in shapes), strict=True)
+    found = (_bent(gray, corners_px, bulges_px, codebook) for corners_px, bulges_px in read)
+    promising = [candidate for candidate in found if candidate is not None]
+    return sorted(promising, key=lambda c: -c.reading.correlation)[:MAX_BENT]
+
+
+def _framed_bent(gray: Image, shapes: BentQuads) -> NDArray[np.bool_]:
+    """Return which shapes are darker inside their bulging edges than outside, on at least three sides."""
+    shares = np.maximum(_profiles(_FRAME)[0], 0.0)
+    at = points_in(shapes.corners_px, _FRAME) + shares @ shapes.bulges_px
+    values = sample(gray, at).reshape(len(at), 2, 4, -1).mean(axis=3)
+    return (values[:, 0] - values[:, 1] >= LEAST_STEP_GREY).sum(axis=1) >= 3
+
+
+def _bent(gray: Image, corners_px: Array, bulges_px: Array, codebook: Codebook) -> Candidate | None:
+    """Return what one bent shape reads through the best of all shifts along its sides, None when hopeless."""
+    right = (corners_px[1] - corners_px[0] + corners_px[2] - corners_px[3]) / 2
+    down = (corners_px[3] - corners_px[0] + corners_px[2] - corners_px[1]) / 2
+    by_side, rows, columns = _BENT_SAMPLES
+    base = points_in(corners_px[None], SAMPLES)[0] + by_side @ bulges_px
+    along = _SHIFTS[:, 0, None, None] * (rows[:, None] * right) + _SHIFTS[:, 1, None, None] * (columns[:, None] * down)
+    readings = codebook.read(cell_values(gray, (base + along).astype(np.float32)))
     best = max(range(len(readings)), key=lambda i: readings[i].correlation)
+    if readings[best].correlation < PROMISING_BENT:
+        return None
+    by_side, rows, columns = _BENT_KNOTS
+    shift = _SHIFTS[best]
+    knots_px = points_in(corners_px[None], KNOTS)[0] + by_side @ bulges_px
+    knots_px = knots_px + rows[:, None] * right * shift[0] + columns[:, None] * down * shift[1]
     turns = readings[best].quarter_turns
-    knots = np.roll(np.arange(len(KNOTS)).reshape(-1, 4), -turns, axis=1).ravel()  # knots come in fours, like corners
-    return Candidate(readings[best], np.roll(corners, -turns, axis=0), ThinPlateWarp(_PLATE, places[best][knots]))
+    order = np.roll(np.arange(len(KNOTS)).reshape(-1, 4), -turns, axis=1).ravel()  # knots come in fours, like corners
+    warp = BentWarp.from_points(KNOTS, knots_px[order])
+    return Candidate(readings[best], np.roll(corners_px, -turns, axis=0), warp, bent=True)
+
+
+_BENT_SAMPLES, _BENT_KNOTS = _profiles(SAMPLES), _profiles(KNOTS)
+
+
+def aligned(gray: Image, candidate: Candidate, codebook: Codebook, artwork: Artwork) -> Candidate | None:
+    """Return a candidate moved until it looks as it reads, None when it then does not read as that surely."""
+    marker_id, side_px = candidate.reading.marker_id, candidate.side_px
+    layer = int(artwork.layer_scores(gray, candidate.warp, marker_id, side_px).argmax())
+    expected = artwork.expected(marker_id, side_px)[layer]
+    warp = candidate.warp
+    assert isinstance(warp, HomographyWarp | BentWarp)
+    reading = candidate.reading
+    for blur, steps, least in ((COARSE_BLUR, COARSE_STEPS, HOPELESS), (0.0, FINE_STEPS, ACCEPT_OF_MANY_WARPS)):
+        warp = align(gray, warp, artwork.points, expected, blur=blur, steps=steps)
+        reading = codebook.read_as(cell_values(gray, warp(SAMPLES)[None])[0], marker_id, side_px)
+        if reading.correlation < least:
+            return None
+    return replace(candidate, reading=reading, corners_px=warp(OUTER), warp=warp, aligned=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -16,15 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astratag.camera import Camera
-from astratag.candidates import OUTER, PROMISING, SURE, Candidate, bent_candidates, flat_candidates
+from astratag.candidates import OUTER, PROMISING, SURE, Candidate, aligned, bent_candidates, flat_candidates
 from astratag.detection import Detection, LayerDetection, PlanarPose
 from astratag.dictionary import Dictionary, load_dictionary
 from astratag.edges import Transfer, inverse_transfer
 from astratag.fit import measure_layers
-from astratag.geometry import LAYERS, TEMPLATE_UNITS, layer_points, square
+from astratag.geometry import LAYERS, TEMPLATE_UNITS, Layer, layer_points, square
 from astratag.grow import Fit, fit_own_edges, grow, layer_side_px, settle
 from astratag.pose import planar_poses, poses_from_square, refine_on_corners
-from astratag.search import find_quads
+from astratag.search import COARSE, FAINT, NARROW, PLAIN, Outlines, bent_quads_of, find_outlines, quads_of
 from astratag.signature import ACCEPT, Artwork, Codebook, Reading, layer_cells
 from astratag.surface import Flat, Surface
 from astratag.tps import KNOTS
@@ -39,12 +40,35 @@ LEAST_LIKENESS = 0.45
 """Correlation of the whole print with what is seen through a fit, below which it is something else."""
 CERTAIN_LIKENESS = 0.75
 """Likeness from which no other layer is tried."""
+LEAST_LOOKS = (0.72, 0.72, 0.85)
+"""Correlation of a square and its surroundings with what it reads, by layer, without which its edges must agree.
+
+More of the innermost, which has no other inside it to tell it by.
+"""
+ACCEPT_OF_LOOKS, SURE_LOOKS = 0.82, 0.88
+"""Correlation from which a square is believed whose edges cannot be measured: with few wrong cells, with more."""
+FEW_WRONG, MOST_WRONG = 8, 9
+"""Cells of such a square that may be on the wrong side of half way; blur alone puts some there."""
+CLEARLY_THAT_LAYER = 0.12
+"""How much better such a square must look as one layer than as any other: a wrong one makes the range wrong."""
+LIKELY_THAT_LAYER, LIKELY_LOOKS = 0.05, 0.5
+"""The same where its edges agree too, of the clearest layer measured; and how well that layer must look."""
+MOVED_PX, MOVED = 4.0, 0.1
+"""How far an alignment may move corners: pixels, or a fraction of the square's side if that is more."""
+LOOKS_SIGMA_PX, LOOKS_SIGMA = 0.3, 0.01
+"""Standard deviation of corners that were aligned, not measured: in pixels, and more as a fraction of a bent side."""
 AMBIGUOUS_RATIO, AMBIGUOUS_RMS_PX = 4.0, 0.05
 """Both planar poses are tried when the worse fits the corners within this factor of the better, or of this residual."""
 SAME_COST, SAME_POSE_RAD = 0.98, 0.02
 NOTICEABLE_BEND = 0.02
 """A print of unknown surface is called curved from this bend on, as a fraction of its side."""
 GRID_LINES = 9
+GRID = np.stack(np.meshgrid(*[np.linspace(0.0, TEMPLATE_UNITS, GRID_LINES)] * 2), axis=-1)
+"""The print's regular grid (9, 9, 2), template units, rows from the top."""
+MAX_ALIGNED = 3
+"""Candidates moved until they look as they read, in one search."""
+MOVES, DAMPING = 8, 0.03
+"""Damped Gauss-Newton steps from the plane through a bent square's corners onto the square."""
 
 
 SQUARES = np.array([square(*layer.black) for layer in LAYERS])
@@ -108,14 +132,19 @@ class Detector:
         return self.find(self.view(image, camera))
 
     def find(self, view: View) -> list[Detection]:
-        """Return the markers in a whole image, the surest first."""
+        """Return the markers in a whole image, the surest first.
+
+        One way of telling ink from paper after another, the fastest first, as long as nothing sure is found.
+        """
         large = view.gray.size > HALVE_FROM_PX
-        found, rest = self.search(view, find_quads(view.gray, halve=large))
-        if large and not found:
-            found, rest = self.search(view, find_quads(view.gray))
-        if not isinstance(self.default.surface, Flat) and all(seen.correlation < SURE for seen in found):
-            bent = self._confirm_all(view, bent_candidates(view.gray, rest, self._codebook, self._artwork))
-            found += bent
+        found: list[Detection] = []
+        for how in (COARSE, NARROW, PLAIN, FAINT) if large else (PLAIN, NARROW, FAINT):
+            outlines = find_outlines(view.gray, how)
+            found += self.search(view, outlines)
+            if not _sure(found) and how != COARSE:
+                found += self._search_bent(view, outlines)
+            if _sure(found) or (found and how != COARSE):
+                break
         return surest(found)
 
     def view(
@@ -141,25 +170,80 @@ class Detector:
         """Return how a marker was made."""
         return self.markers.get(marker_id, self.default)
 
-    def search(self, view: View, quads: Array) -> tuple[list[Detection], list[Candidate]]:
-        """Return the markers among rough quads (Q, 4, 2), each once, and the quads that no sure marker explains."""
-        promising, faint = flat_candidates(view.gray, quads, self._codebook)
-        found = self._confirm_all(view, promising)
-        sure = [seen for seen in found if seen.correlation >= SURE]
-        return found, [c for c in promising + faint if not _inside_any(c.corners_px, sure)]
+    def search(self, view: View, outlines: Outlines) -> list[Detection]:
+        """Return the markers among outlines read as if flat, each once, the surest first."""
+        return surest(self._confirm_all(view, flat_candidates(view.gray, quads_of(outlines), self._codebook)))
+
+    def _search_bent(self, view: View, outlines: Outlines) -> list[Detection]:
+        """Return the markers among outlines with bulging sides, none when every marker is on a plane."""
+        if not self._bends:
+            return []
+        return surest(self._confirm_all(view, bent_candidates(view.gray, bent_quads_of(outlines), self._codebook)))
+
+    @property
+    def _bends(self) -> bool:
+        """Return whether a marker may be on a curved surface: one that is listed, or any when none is."""
+        specs = self.markers.values() or [self.default]
+        return any(not isinstance(spec.surface, Flat) for spec in specs)
 
     def _confirm_all(self, view: View, candidates: Sequence[Candidate]) -> list[Detection]:
-        """Return the markers among candidates, each once."""
+        """Return the markers among candidates, each once; by their edges, else the best few after an alignment."""
         found: list[Detection] = []
-        for candidate in candidates:
+
+        def take(candidate: Candidate, detection: Detection | None) -> bool:
+            if detection is not None and not _inside_any(detection.corners_px, found):
+                found.append(detection)
+            return detection is not None
+
+        left = [
+            c
+            for c in candidates
+            if not _inside_any(c.corners_px, found) and (c.bent or not take(c, self._confirm_edges(view, c)))
+        ]
+        for candidate in [] if _sure(found) else left[:MAX_ALIGNED]:
             if not _inside_any(candidate.corners_px, found):
-                detection = self._confirm(view, candidate)
-                if detection is not None and not _inside_any(detection.corners_px, found):
-                    found.append(detection)
+                take(candidate, self._confirm_aligned(view, candidate))
         return found
 
-    def _confirm(self, view: View, candidate: Candidate) -> Detection | None:
-        """Return the marker a candidate is a layer of, None when its edges, its code or its looks say otherwise."""
+    def _confirm_aligned(self, view: View, candidate: Candidate) -> Detection | None:
+        """Return the marker a candidate is a layer of, once moved until it looks as it reads; None when it does not.
+
+        What then reads surely is a marker even where its edges are too blurred to be measured.
+        """
+        sure = aligned(view.gray, candidate, self._codebook, self._artwork)
+        if sure is None:
+            if candidate.bent or candidate.reading.correlation < ACCEPT_OF_LOOKS:
+                return None
+            sure = candidate
+        if np.abs(sure.corners_px - candidate.corners_px).max() > max(MOVED_PX, MOVED * candidate.side_px):
+            return None
+        return self._confirm_edges(view, sure) or self._confirm_looks(view, sure)
+
+    def _confirm_looks(self, view: View, candidate: Candidate) -> Detection | None:
+        """Return the marker an aligned candidate is a layer of, its corners where the alignment put them."""
+        marker_id = candidate.reading.marker_id
+        scores = self._artwork.layer_scores(view.gray, candidate.warp, marker_id, candidate.side_px)
+        layer = int(scores.argmax())
+        reading = candidate.reading
+        least = ACCEPT_OF_LOOKS if reading.hamming <= FEW_WRONG else SURE_LOOKS
+        if reading.correlation < least or reading.hamming > MOST_WRONG:
+            return None
+        if scores[layer] < LEAST_LOOKS[layer] or _lead(scores, layer) < CLEARLY_THAT_LAYER:
+            return None
+        if candidate.bent and layer == len(LAYERS) - 1:
+            return None  # nothing inside fixes its bend, and the whole print is over five times as large
+        flat = replace(candidate, bent=False)  # a bend does not carry from an inner layer to the whole print
+        warp = self._whole_print(candidate if layer == 0 else flat, layer)
+        sigma_px = LOOKS_SIGMA_PX + LOOKS_SIGMA * candidate.side_px * candidate.bent
+        corners = LayerDetection(layer, candidate.corners_px, sigma_px)
+        height, width = view.gray.shape
+        if (candidate.corners_px < 0).any() or (candidate.corners_px > (width - 1, height - 1)).any():
+            return None
+        method = "tps" if candidate.bent else "planar"
+        return self._described(view, candidate.reading, warp, (corners,), method)
+
+    def _confirm_edges(self, view: View, candidate: Candidate) -> Detection | None:
+        """Return the marker a candidate is a layer of by its edges, None when these, its code or its looks disagree."""
         marker_id = candidate.reading.marker_id
         guesses = self._artwork.layer_scores(view.gray, candidate.warp, marker_id)
         best: tuple[float, Fit | None] = (LEAST_LIKENESS, None)
@@ -178,7 +262,26 @@ class Detector:
         else:
             method = "tps" if candidate.bent or _bend_fraction(fit.warp) > NOTICEABLE_BEND else "planar"
         detection = self.describe(view, marker_id, fit, method)
-        return detection if detection is None else self._with_other_pose(view, detection, fit)
+        if detection is None or not self._layers_agree(view, detection, fit.warp):
+            return None
+        return self._with_other_pose(view, detection, fit)
+
+    def _layers_agree(self, view: View, detection: Detection, warp: FittedWarp) -> bool:
+        """Return whether a measured layer looks like itself and not like another, which may have the same edges."""
+        for seen in detection.layers:
+            layer = LAYERS[seen.layer]
+            side_px = layer_side_px(warp, seen.layer)
+            inside = partial(_inside_layer, warp, layer)
+            scores = self._artwork.layer_scores(view.gray, inside, detection.marker_id, side_px)
+            if scores[seen.layer] >= LIKELY_LOOKS and _lead(scores, seen.layer) >= LIKELY_THAT_LAYER:
+                return True
+        return False
+
+    def _whole_print(self, candidate: Candidate, layer: int) -> HomographyWarp | BentWarp:
+        """Return the warp of the whole print when the candidate is ``layer`` of it."""
+        if candidate.bent:
+            return BentWarp.from_points(layer_points(KNOTS, LAYERS[layer]), candidate.warp(KNOTS))
+        return HomographyWarp.from_points(square(*LAYERS[layer].black), candidate.corners_px)
 
     def _fit(self, view: View, candidate: Candidate, layer: int) -> Fit | None:
         """Return the fit of a whole marker begun at one layer, None as soon as its code is not read there."""
@@ -214,12 +317,12 @@ class Detector:
         spec = self.spec(candidate.reading.marker_id)
         template = square(*LAYERS[layer].black)
         if view.camera is not None and spec.surface is not None:
+            knots = layer_points(KNOTS, LAYERS[layer])
             for T in poses_from_square(view.camera, template, candidate.corners_px, spec.side_m, spec.surface):
-                yield PoseWarp(view.camera, spec.side_m, spec.surface, T)
-        elif candidate.bent:
-            yield BentWarp.from_points(layer_points(KNOTS, LAYERS[layer]), candidate.warp(KNOTS))
+                start = PoseWarp(view.camera, spec.side_m, spec.surface, T)
+                yield moved_onto(start, knots, candidate.warp(KNOTS)) if candidate.bent else start
         else:
-            yield HomographyWarp.from_points(template, candidate.corners_px)
+            yield self._whole_print(candidate, layer)
 
     def describe(self, view: View, marker_id: int, fit: Fit, method: str) -> Detection | None:
         """Return the detection a fit amounts to, None when the code read through it is not the marker's."""
@@ -227,22 +330,36 @@ class Detector:
         if reading is None or reading.correlation < ACCEPT:
             return None
         layers = measure_layers(fit, view.gray.shape)
-        spec, warp = self.spec(marker_id), fit.warp
+        if isinstance(fit.warp, PoseWarp):
+            return self._described(view, reading, fit.warp, layers, method, fit.covariance)
+        return self._described(view, reading, fit.warp, layers, method)
+
+    def _described(
+        self,
+        view: View,
+        reading: Reading,
+        warp: FittedWarp,
+        layers: tuple[LayerDetection, ...],
+        method: str,
+        covariance: Array | None = None,
+    ) -> Detection:
+        """Return a detection; ``covariance`` is of a warp that is a pose."""
+        spec = self.spec(reading.marker_id)
         curved = method == "tps" or (isinstance(warp, PoseWarp) and warp.curved)
-        T_cam_marker = covariance = rms_px = None
+        T_cam_marker = rms_px = None
         poses: tuple[PlanarPose, ...] = ()
         if view.camera is not None:
             surface = spec.surface or Flat()
             poses = planar_poses(view.camera, layers, spec.side_m, surface)
             if isinstance(warp, PoseWarp):
-                T_cam_marker, covariance = warp.T_cam_marker, fit.covariance
+                T_cam_marker = warp.T_cam_marker
                 rms_px = _corner_rms(warp, layers) if layers else None
             elif poses:
                 start = PoseWarp(view.camera, spec.side_m, surface, poses[0].T_cam_marker)
                 T_cam_marker, covariance, rms_px = refine_on_corners(start, layers)
         return Detection(
             family=self.dictionary.family,
-            marker_id=marker_id,
+            marker_id=reading.marker_id,
             corners_px=next((seen.corners_px for seen in layers if seen.layer == 0), warp(OUTER)),
             layers=layers,
             correlation=reading.correlation,
@@ -271,6 +388,33 @@ class Detector:
         return best
 
 
+def moved_onto(warp: PoseWarp, template: Array, points_px: Array) -> PoseWarp:
+    """Return a pose moved until template points (N, 2) of its print lie nearest to where they are seen (N, 2)."""
+    for _ in range(MOVES):
+        J = warp.jacobian(template).reshape(-1, 6)
+        scale = np.linalg.norm(J, axis=0) + 1e-12
+        left = (points_px - warp(template)).ravel()
+        damped = np.vstack([J / scale, DAMPING * np.eye(6)])
+        delta = np.linalg.lstsq(damped, np.append(left, np.zeros(6)), rcond=None)[0]
+        warp = warp.stepped(delta / scale)
+    return warp
+
+
+def _inside_layer(warp: FittedWarp, layer: Layer, points: Array) -> Array:
+    """Return the pixels of points (..., 2) given as if ``layer`` were the outermost square."""
+    return warp(layer_points(points, layer))
+
+
+def _lead(scores: Array, layer: int) -> float:
+    """Return how much better one layer's score (3,) is than the best of the others."""
+    return float(scores[layer] - np.delete(scores, layer).max())
+
+
+def _sure(found: Sequence[Detection]) -> bool:
+    """Return whether markers were found and all of them surely."""
+    return bool(found) and all(seen.correlation >= SURE for seen in found)
+
+
 def _bend_fraction(warp: FittedWarp) -> float:
     """Return how far a print is bent, as a fraction of its side."""
     return float(np.abs(warp.bend).max()) / layer_side_px(warp, 0) if isinstance(warp, BentWarp) else 0.0
@@ -292,8 +436,7 @@ def as_gray(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 def warp_grid(warp: FittedWarp) -> Array:
     """Return the print's regular grid (9, 9, 2) in the image, rows from the top."""
-    span = np.linspace(0.0, TEMPLATE_UNITS, GRID_LINES)
-    return warp(np.stack(np.meshgrid(span, span), axis=-1))
+    return warp(GRID)
 
 
 def _corner_rms(warp: PoseWarp, layers: Sequence[LayerDetection]) -> float:

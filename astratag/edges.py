@@ -7,6 +7,7 @@ in linear light, and the place of steepest rise from ink to paper is found betwe
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal
 
 import cv2
@@ -72,11 +73,13 @@ EDGE_POINTS = _STARTS[:, None, :] + ALONG[None, :, None] * (_ENDS - _STARTS)[:, 
 """Sampling points (20, 24, 2), template units."""
 EDGE_LAYER = np.array([e.layer for e in EDGES])
 EDGE_IS_FRAME = np.array([e.frame for e in EDGES])
+_TO_PAPER = np.where(EDGE_IS_FRAME, -1.0, 1.0)[:, None]
 EDGE_REACH = np.array([e.reach for e in EDGES])
 _FEW = np.array([0, POINTS_PER_EDGE // 2, POINTS_PER_EDGE - 1])
 _OUTWARDS = np.array([(0.0, -1.0), (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0)])[[e.side for e in EDGES]][:, None, :]
-_INWARDS = EDGE_POINTS[:, _FEW] - _OUTWARDS
-"""A few of the points of each edge, one unit further in."""
+_FEW_POINTS = EDGE_POINTS[:, _FEW]
+_PROBES = np.concatenate([EDGE_POINTS, _FEW_POINTS - _OUTWARDS], axis=1)
+"""The points of each edge, and a few of them one unit further in."""
 LEAST_RISE, LEAST_RISE_GREY = 0.35, 0.05
 """How steep a rise must be: a fraction of what is typical of its own edge, and in linear grey values a pixel."""
 
@@ -122,45 +125,52 @@ def locate(light: NDArray[np.float32], warp: FittedWarp, edges: NDArray[np.int64
     ``light`` is the image in linear light.  An edge is never looked for beyond its own reach, so that
     neighbours are not taken for it.
     """
-    template = EDGE_POINTS[edges]
-    predicted = warp(template)
+    seen_px = warp(_PROBES[edges])
+    predicted, inwards = seen_px[:, :POINTS_PER_EDGE], seen_px[:, POINTS_PER_EDGE:]
     tangent = np.empty_like(predicted)
     tangent[:, 1:-1] = (predicted[:, 2:] - predicted[:, :-2]) / 2
     tangent[:, 0], tangent[:, -1] = predicted[:, 1] - predicted[:, 0], predicted[:, -1] - predicted[:, -2]
     spacing = np.maximum(np.hypot(tangent[..., 0], tangent[..., 1]), 1e-9)
     length_px = spacing.mean(axis=1) * (POINTS_PER_EDGE - 1) / (1 - 2 * END_MARGIN)
-    to_paper = np.where(EDGE_IS_FRAME[edges], -1.0, 1.0)[:, None, None]
-    normal = np.stack([tangent[..., 1], -tangent[..., 0]], axis=2) / spacing[..., None] * to_paper
+    to_paper = _TO_PAPER[edges] / spacing
+    normal = np.empty_like(predicted)
+    normal[..., 0], normal[..., 1] = tangent[..., 1] * to_paper, -tangent[..., 0] * to_paper
     # how far apart neighbouring edges look, where that is least: small when the print is seen at a slant
-    across = (warp(_INWARDS[edges]) - predicted[:, _FEW]) * normal[:, _FEW]
+    across = (inwards - predicted[:, _FEW]) * normal[:, _FEW]
     reach_px = EDGE_REACH[edges] * np.abs(across.sum(axis=2)).min(axis=1)
+    visible = warp.visible(_FEW_POINTS[edges].reshape(-1, 2)).reshape(-1, len(_FEW)).all(axis=1)
 
     half = int(np.ceil((search_px + 3 * SMOOTHING_PX) / STEP_PX))
-    steps = np.arange(-half, half + 1, dtype=np.float32) * STEP_PX
-    at = np.clip(predicted, -1e4, 1e4).astype(np.float32)[:, :, None, :]
-    at = at + steps[:, None] * normal.astype(np.float32)[:, :, None, :]
-    height, width = light.shape
-    ends = at[:, :, [0, -1], :]
-    inside = ((ends >= 0) & (ends <= (width - 1, height - 1))).all(axis=(2, 3))
-    profile = cv2.remap(
-        light, at.reshape(-1, len(steps), 2), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    ).reshape(at.shape[:3])
-    offset, rise = _steepest_rise(profile, np.minimum(search_px, 0.6 * reach_px))
-    visible = warp.visible(template[:, _FEW].reshape(-1, 2)).reshape(-1, len(_FEW)).all(axis=1)
-    in_view: Mask = inside & np.asarray(visible)[:, None]
+    in_view: Mask = _inside(predicted, half * STEP_PX * normal, light.shape) & np.asarray(visible)[:, None]
+    steps = np.arange(-half, half + 1, dtype=np.float32) * np.float32(STEP_PX)
+    at = np.clip(predicted, -1e4, 1e4).astype(np.float32).reshape(-1, 2)
+    aside = normal.astype(np.float32).reshape(-1, 2)
+    x, y = (at[:, axis, None] + aside[:, axis, None] * steps for axis in (0, 1))
+    profile = cv2.remap(light, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    offset, rise = _steepest_rise(profile.reshape(*normal.shape[:2], -1), np.minimum(search_px, 0.6 * reach_px))
     typical = np.maximum(rise, 0.0).mean(axis=1, keepdims=True)
     found = in_view & np.isfinite(offset) & (rise > np.maximum(LEAST_RISE * typical, LEAST_RISE_GREY))
     return EdgePoints(edges, predicted, normal, np.where(found, offset, 0.0), found, in_view, length_px, reach_px)
 
 
-def _derivative_kernel() -> NDArray[np.float32]:
-    """Return the row (1, K) whose correlation with a profile is its smoothed slope, per step."""
-    x = np.arange(-np.ceil(3.5 * SMOOTHING_PX / STEP_PX), np.ceil(3.5 * SMOOTHING_PX / STEP_PX) + 1) * STEP_PX
+def _inside(middle: Array, half: Array, shape: tuple[int, ...]) -> Mask:
+    """Return which profiles (E, M), reaching ``half`` (E, M, 2) to either side of ``middle``, are inside an image."""
+    reach = np.abs(half)
+    inside = (middle >= reach) & (middle + reach <= (shape[1] - 1, shape[0] - 1))
+    return inside[..., 0] & inside[..., 1]
+
+
+@cache
+def _derivative(samples: int) -> NDArray[np.float32]:
+    """Return the matrix (S, S) that takes profiles (N, S), continued at their ends, to their smoothed slopes a step."""
+    reach = int(np.ceil(3.5 * SMOOTHING_PX / STEP_PX))
+    x = np.arange(-reach, reach + 1) * STEP_PX
     kernel = x * np.exp(-0.5 * (x / SMOOTHING_PX) ** 2)
-    return (kernel / (kernel @ x))[None].astype(np.float32)
-
-
-_DERIVATIVE = _derivative_kernel()
+    kernel /= kernel @ x
+    matrix = np.zeros((samples, samples))
+    for column in range(samples):
+        np.add.at(matrix[:, column], np.clip(np.arange(column - reach, column + reach + 1), 0, samples - 1), kernel)
+    return matrix.astype(np.float32)
 
 
 def _steepest_rise(profile: NDArray[np.float32], limit_px: Array) -> tuple[Array, Array]:
@@ -169,7 +179,7 @@ def _steepest_rise(profile: NDArray[np.float32], limit_px: Array) -> tuple[Array
     The place is NaN where the steepest rise lies at the limit (E,) of the search: it is something else's.
     """
     edges, points, samples = profile.shape
-    slope = cv2.filter2D(profile.reshape(-1, samples), -1, _DERIVATIVE, borderType=cv2.BORDER_REPLICATE)
+    slope = profile.reshape(-1, samples) @ _derivative(samples)
     steps = (np.arange(samples) - samples // 2) * STEP_PX
     trusted_px = np.minimum(limit_px, steps[-1] - 3 * SMOOTHING_PX + 0.3)[:, None] + 1e-9
     forbidden = np.where(np.abs(steps) <= trusted_px, 0.0, -np.inf).astype(np.float32)

@@ -33,7 +33,8 @@ PULL_PX, PULL_FLOOR_PX = 0.023, 0.005
 """How far a whole edge may be off when its neighbours are as near as ``SHARP_REACH_PX``, and at least."""
 TUKEY = 4.685
 """Residuals beyond this many standard deviations weigh nothing (95 % efficiency on Gaussian noise)."""
-REWEIGHTINGS = 4
+REWEIGHTINGS, SAME_SPREAD = 4, 0.02
+"""Weights are found again until the residuals' spread changes by no more than this fraction."""
 MAX_STEPS, LINEAR_PX = 6, 0.01
 """Gauss-Newton steps end when the last did what its derivative promised, to this many pixels."""
 SHARP_REACH_PX, LEAST_REACH_PX = 4.0, 1.2
@@ -76,9 +77,9 @@ def fit_edges(
     use = _usable(seen, sharp_only)
     if len(set((seen.edge[use.any(axis=1)] % 4).tolist())) < 4:  # edges come in fours: sides of a square
         return None
-    template, normal, offset = EDGE_POINTS[seen.edge][use], seen.normal[use], seen.offset_px[use]
-    share, common = (np.broadcast_to(part[:, None], use.shape)[use] for part in _trust(seen))
-    fitted, left, solution = _gauss_newton(warp, template, normal, offset, share, common)
+    share, common = (part.repeat(POINTS_PER_EDGE)[use.ravel()] for part in _trust(seen))
+    offset = seen.offset_px[use]
+    fitted, left, solution = _gauss_newton(warp, seen, use, share, common)
     residual = left - solution.x[-1]
     weights, offsets = np.zeros(use.shape), np.zeros(use.shape)
     weights[use], offsets[use] = solution.weight, offset - solution.x[-1]
@@ -98,22 +99,28 @@ def fit_edges(
 
 
 def _gauss_newton(
-    warp: W, template: Array, normal: Array, offset: Array, share: Array, common: Array
+    warp: W, seen: EdgePoints, use: NDArray[np.bool_], share: Array, common: Array
 ) -> tuple[W, Array, _Solution]:
-    """Return the warp that brings template points (N, 2) to where they were measured, ``offset`` along ``normal``.
+    """Return the warp that brings the N points to ``use`` to where they were measured.
 
-    Also what is left of the offsets, the bias included, and the last solution.  One step does where the warp is
-    as good as linear; a small square seen nearly square-on needs more, for its tilt shows in the second order.
+    Also what is left of their offsets (N,), the bias included, and the last solution.  One step does where the warp
+    is as good as linear; a small square seen nearly square-on needs more, for its tilt shows in the second order.
     """
-    places_px = warp(template) + offset[:, None] * normal
-    left = offset
+    template, used = EDGE_POINTS[seen.edge].reshape(-1, 2), use.ravel()  # whole: its places on a surface are kept
+    normal = seen.normal.reshape(-1, 2)
+    places_px = seen.predicted_px.reshape(-1, 2) + seen.offset_px.reshape(-1, 1) * normal
+    left = seen.offset_px[use]
+    prior_sigma = np.append(warp.step_sigma(), BIAS_SIGMA_PX)
     for _ in range(MAX_STEPS):
-        by_warp = (normal[:, None, :] @ warp.jacobian(template))[:, 0]
-        A = np.column_stack([by_warp, np.ones(len(by_warp))])
-        solution = _robust_least_squares(A, left, share, common, np.append(warp.step_sigma(), BIAS_SIGMA_PX))
-        expected = left - by_warp @ solution.x[:-1]
+        J = warp.jacobian(template)
+        by_all = np.ones((len(prior_sigma), len(template)))
+        by_all[:-1] = normal[:, 0] * J[:, 0].T + normal[:, 1] * J[:, 1].T
+        A = by_all[:, used]
+        solution = _robust_least_squares(A, left, share, common, prior_sigma)
+        expected = left - solution.x[:-1] @ A[:-1]
         warp = warp.stepped(solution.x[:-1])
-        left = ((places_px - warp(template)) * normal).sum(axis=1)
+        off = (places_px - warp(template)) * normal
+        left = (off[:, 0] + off[:, 1])[used]
         if np.abs(left - expected).max() < LINEAR_PX:
             break
     return warp, left, solution
@@ -152,20 +159,25 @@ def _trust(seen: EdgePoints) -> tuple[Array, Array]:
 
 
 def _robust_least_squares(A: Array, offset: Array, share: Array, common: Array, prior_sigma: Array) -> _Solution:
-    """Solve A x = offset with Tukey's weights, each unknown known to be 0 within ``prior_sigma`` (P,) beforehand."""
-    scale = np.sqrt((A * A).sum(axis=0)) + 1e-12  # metres and radians differ by orders: solve in units of pixels
-    A = A / scale
+    """Solve x A = offset (N,) with Tukey's weights, each unknown known to be 0 within ``prior_sigma`` (P,) beforehand.
+
+    ``A`` (P, N) has a row for each unknown.
+    """
+    scale = np.sqrt(np.einsum("pn,pn->p", A, A)) + 1e-12  # metres and radians differ by orders: solve in pixels
+    A = A / scale[:, None]
     prior = np.diag((prior_sigma * scale) ** -2.0 + 1e-9)
-    robust = np.ones(len(offset))
     sigma_px = max(_spread(offset - offset.mean()), 0.3)
+    robust: Array | float = 1.0
     for _ in range(REWEIGHTINGS):
         weight = robust / (sigma_px**2 / share + common)
-        weighted = A.T * weight
-        information = weighted @ A + prior
+        weighted = A * weight
+        information = weighted @ A.T + prior
         x = np.linalg.solve(information, weighted @ offset)
-        residual = offset - A @ x
-        sigma_px = max(_spread(residual), NOISE_FLOOR_PX)
-        robust = np.maximum(1 - (residual / (TUKEY * sigma_px)) ** 2, 0) ** 2
+        residual = offset - x @ A
+        before_px, sigma_px = sigma_px, max(_spread(residual), NOISE_FLOOR_PX)
+        if abs(sigma_px - before_px) <= SAME_SPREAD * before_px:
+            break
+        robust = np.square(np.maximum(1 - (residual / (TUKEY * sigma_px)) ** 2, 0))
     return _Solution(x / scale, weight, sigma_px, np.linalg.inv(information) / np.outer(scale, scale))
 
 
@@ -180,57 +192,70 @@ def measure_layers(fit: EdgeFit[W], shape: tuple[int, int]) -> tuple[LayerDetect
 
     Each edge is its predicted curve moved by an offset and a tilt of its own; corners are where neighbours meet.
     """
-    layers = []
+    weight, offset = np.zeros((2, len(EDGES), POINTS_PER_EDGE))
+    weight[fit.points.edge], offset[fit.points.edge] = fit.weight, fit.offset_px
+    weight, offset = weight[_BLACK_EDGES], offset[_BLACK_EDGES]
+    measured = np.flatnonzero((np.count_nonzero(weight, axis=2) >= LEAST_FOUND * POINTS_PER_EDGE).all(axis=1))
+    if len(measured) == 0:
+        return ()
+    corners, sigma_px = _layer_corners(fit.before(_CORNER_PROBES)[:, measured], offset[measured], weight[measured])
     height, width = shape
-    around_px = fit.before(_CORNER_PROBES)
-    for layer in LAYERS:
-        rows = [i for i, e in enumerate(fit.points.edge) if EDGES[e].layer == layer.index and not EDGES[e].frame]
-        if len(rows) == 4 and (fit.weight[rows] > 0).sum(axis=1).min() >= LEAST_FOUND * POINTS_PER_EDGE:
-            corners, sigma_px = _layer_corners(around_px[layer.index], fit.offset_px[rows], fit.weight[rows])
-            if (corners >= 0).all() and (corners <= (width - 1, height - 1)).all():
-                layers.append(LayerDetection(layer.index, corners, sigma_px))
-    return tuple(layers)
+    return tuple(
+        LayerDetection(layer, square_px, sigma)
+        for layer, square_px, sigma in zip(measured.tolist(), corners, sigma_px.tolist(), strict=True)
+        if square_px.min() >= 0 and (square_px.max(axis=0) <= (width - 1, height - 1)).all()
+    )
 
 
 def _corner_probes() -> Array:
-    """Return, for each layer, its corners and a point a little before and after each on the outline (3, 3, 4, 2)."""
+    """Return the layers' corners, and points a little before and after them on the outlines (3, 3 layers, 4, 2)."""
     corners = np.array([square(*layer.black) for layer in LAYERS])
     ahead = 0.02 * (np.roll(corners, -1, axis=1) - corners)
-    return np.stack([corners, corners - np.roll(ahead, 1, axis=1), corners + ahead], axis=1)
+    return np.stack([corners, corners - np.roll(ahead, 1, axis=1), corners + ahead])
 
 
 _CORNER_PROBES = _corner_probes()
 
 
-def _layer_corners(around_px: Array, offset: Array, weight: Array) -> tuple[Array, float]:
-    """Return the corners (4, 2) of a square and their standard deviation from the offsets (4, M) of its edges.
+def _layer_corners(around_px: Array, offset: Array, weight: Array) -> tuple[Array, Array]:
+    """Return the corners (L, 4, 2) of squares and their standard deviations (L,) from the offsets (L, 4, M) of edges.
 
-    ``around_px`` (3, 4, 2) is where the corners are predicted, and the outline a little before and after each.
+    ``around_px`` (3, L, 4, 2) is where the corners are predicted, and the outlines a little before and after each.
     """
     predicted, before, after = around_px
-    # row 0: the edge that ends at the corner, row 1: the one that starts there
-    N = np.stack([_outward(predicted - before), _outward(after - predicted)], axis=1)
-    offsets, variances = _edge_lines(offset, weight)
-    solve = np.linalg.inv(N)
-    met = np.stack([np.roll(offsets[:, 1], 1), offsets[:, 0]], axis=1)
-    uncertain = np.stack([np.roll(variances[:, 1], 1), variances[:, 0]], axis=1)
-    corners = predicted + (solve @ met[:, :, None])[:, :, 0]
-    variance = (solve**2 @ uncertain[:, :, None]).mean()
-    return corners, float(np.sqrt(variance + CORNER_FLOOR_PX**2))
+    ends, variances = _edge_lines(offset, weight)
+    # two lines meet at a corner: the end of one edge and the start of the next
+    nx, ny = _outward(predicted - before)
+    mx, my = _outward(after - predicted)
+    a, b = ends[..., 1][:, _PREVIOUS], ends[..., 0]
+    moved = np.stack([a * my - b * ny, b * nx - a * mx], axis=-1)
+    sine = nx * my - ny * mx
+    a, b = variances[..., 1][:, _PREVIOUS], variances[..., 0]
+    variance = ((a * (my**2 + mx**2) + b * (ny**2 + nx**2)) / (2 * sine**2)).mean(axis=1)
+    return predicted + moved / sine[..., None], np.sqrt(variance + CORNER_FLOOR_PX**2)
 
 
-def _outward(tangent: Array) -> Array:
-    """Return the unit normals (N, 2) to the left of clockwise tangents (N, 2), out of the square."""
-    return np.stack([tangent[:, 1], -tangent[:, 0]], axis=1) / np.linalg.norm(tangent, axis=1, keepdims=True)
+def _outward(tangent: Array) -> tuple[Array, Array]:
+    """Return x and y of the unit normals to the left of clockwise tangents (..., 2), out of the square."""
+    dx, dy = tangent[..., 0], tangent[..., 1]
+    length = np.sqrt(dx * dx + dy * dy)
+    return dy / length, -dx / length
 
 
 def _edge_lines(offset: Array, weight: Array) -> tuple[Array, Array]:
-    """Return the offsets (E, 2) of lines fitted along edges (E, M) at their starts and ends, and their variances."""
-    information = np.einsum("em,mi,mj->eij", weight, _LINE, _LINE)
-    covariance = np.linalg.inv(information)
-    ends = covariance @ ((weight * offset) @ _LINE)[:, :, None]
-    return ends[:, :, 0], np.diagonal(covariance, axis1=1, axis2=2)
+    """Return the offsets (..., 2) of lines fitted along edges (..., M) at their two ends, and their variances."""
+    moments = weight @ _LINE_MOMENTS
+    ss, se, ee = moments[..., 0], moments[..., 1], moments[..., 2]
+    seen = (weight * offset) @ _LINE
+    s, e = seen[..., 0], seen[..., 1]
+    determinant = ss * ee - se * se
+    variances = np.stack([ee, ss], axis=-1) / determinant[..., None]
+    return np.stack([ee * s - se * e, ss * e - se * s], axis=-1) / determinant[..., None], variances
 
 
+_BLACK_EDGES = np.array([[i for i, e in enumerate(EDGES) if e.layer == k and not e.frame] for k in range(len(LAYERS))])
+"""The edges (3, 4) of each layer's black square, clockwise from the top."""
+_PREVIOUS = np.array([3, 0, 1, 2])
 _LINE = np.stack([1 - ALONG, ALONG], axis=1)
 """What the points of an edge feel (M, 2) of an offset at its start and at its end."""
+_LINE_MOMENTS = np.stack([_LINE[:, 0] ** 2, _LINE[:, 0] * _LINE[:, 1], _LINE[:, 1] ** 2], axis=1)

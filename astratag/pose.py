@@ -11,15 +11,18 @@ from numpy.typing import NDArray
 
 from astratag.camera import Camera
 from astratag.detection import LayerDetection, PlanarPose
-from astratag.geometry import LAYERS, print_from_template, square
+from astratag.geometry import LAYERS, square
 from astratag.surface import Surface
-from astratag.transforms import pose
-from astratag.warp import PoseWarp
+from astratag.transforms import pose, transform
+from astratag.warp import PoseWarp, on_surface
 
 Array = NDArray[np.float64]
 
+_SQUARES = [square(*layer.black) for layer in LAYERS]
 REFINEMENT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 1e-8)
 MAX_STEPS = 30
+HOPELESS_RATIO, HOPELESS_RMS_PX = 10.0, 1.0
+"""A planar pose that fits the corners worse than the better one by this factor, and than this, is not refined."""
 CONVERGED_PX2 = 1e-9
 """Stop when the squared error, in sigmas, no longer falls by this fraction."""
 
@@ -41,7 +44,7 @@ def poses_from_square(
     surface the plane is the one through its corners.
     Collins and Bartoli, "Infinitesimal plane-based pose estimation", IJCV 2014.
     """
-    points_marker = surface.points(print_from_template(template, side_m))
+    points_marker = on_surface(surface, side_m, template)[0].T
     behind_m = points_marker[:, 2].mean()
     in_plane = points_marker * (1.0, 1.0, 0.0)
     rays = camera.undistort(corners_px)
@@ -65,29 +68,52 @@ def poses_from_square(
 def planar_poses(
     camera: Camera, layers: Sequence[LayerDetection], side_m: float, surface: Surface
 ) -> tuple[PlanarPose, ...]:
-    """Return both poses that explain the measured layers, each refined on all their corners, the better first."""
+    """Return both poses that explain the measured layers, refined on all their corners, the better first.
+
+    One that explains them far worse than the other is left as the largest layer alone has it.
+    """
     if not layers:
         return ()
     largest = min(layers, key=lambda seen: seen.layer)
-    starts = poses_from_square(camera, square(*LAYERS[largest.layer].black), largest.corners_px, side_m, surface)
-    template, corners_px = np.concatenate([square(*LAYERS[seen.layer].black) for seen in layers]), _corners(layers)
-    points_marker = surface.points(print_from_template(template, side_m))
-    found = []
-    for start in starts:
-        rotation, translation = cv2.solvePnPRefineLM(
-            points_marker,
-            corners_px,
-            camera.K,
-            camera.distortion,
-            cv2.Rodrigues(start[:3, :3])[0],
-            start[:3, 3:].copy(),
-            REFINEMENT,
-        )
-        if np.isfinite(rotation).all() and translation[2, 0] > 0:
-            T_cam_marker = pose(cv2.Rodrigues(rotation)[0], translation)
-            off = PoseWarp(camera, side_m, surface, T_cam_marker)(template) - corners_px
-            found.append(PlanarPose(T_cam_marker, float(np.sqrt((off**2).sum(axis=1).mean()))))
+    starts = poses_from_square(camera, _SQUARES[largest.layer], largest.corners_px, side_m, surface)
+    template, corners_px = np.concatenate([_SQUARES[seen.layer] for seen in layers]), _corners(layers)
+
+    points_marker = np.ascontiguousarray(on_surface(surface, side_m, template)[0].T)
+    rms_px = _reprojection_rms(camera, starts, points_marker, corners_px)
+    hopeless_px = max(HOPELESS_RMS_PX, HOPELESS_RATIO * min(rms_px, default=0.0))
+    poses = [
+        _refined(camera, start, points_marker, corners_px) if rms <= hopeless_px else start
+        for start, rms in zip(starts, rms_px, strict=True)
+    ]
+    rms_px = _reprojection_rms(camera, poses, points_marker, corners_px)
+    found = [PlanarPose(T_cam_marker, rms) for T_cam_marker, rms in zip(poses, rms_px, strict=True)]
     return tuple(sorted(found, key=lambda planar: planar.reprojection_rms_px))
+
+
+def _reprojection_rms(camera: Camera, poses: Sequence[Array], points_marker: Array, seen_px: Array) -> list[float]:
+    """Return how far points (N, 3) of the marker are from where they are seen (N, 2) under each pose, rms pixels."""
+    if not poses:
+        return []
+    points_cam = np.concatenate([transform(T_cam_marker, points_marker) for T_cam_marker in poses])
+    points_cam[:, 2] = np.maximum(points_cam[:, 2], 1e-6)  # behind the camera is far outside every image
+    at = camera.project(points_cam).reshape(len(poses), -1, 2)
+    return [float(rms) for rms in np.sqrt(((at - seen_px) ** 2).sum(axis=(1, 2)) / len(seen_px))]
+
+
+def _refined(camera: Camera, T_cam_marker: Array, points_marker: Array, seen_px: Array) -> Array:
+    """Return a pose refined on points (N, 3) of the marker seen at (N, 2) pixels; as it was where that fails."""
+    rotation, translation = cv2.solvePnPRefineLM(
+        points_marker,
+        seen_px,
+        camera.K,
+        camera.distortion,
+        cv2.Rodrigues(T_cam_marker[:3, :3])[0],
+        T_cam_marker[:3, 3:].copy(),
+        REFINEMENT,
+    )
+    if not np.isfinite(rotation).all() or translation[2, 0] <= 0:
+        return T_cam_marker
+    return pose(cv2.Rodrigues(rotation)[0], translation)
 
 
 def _corners(layers: Sequence[LayerDetection]) -> Array:

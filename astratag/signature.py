@@ -8,6 +8,7 @@ removed, and what is left is correlated with every code in every orientation: so
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -15,7 +16,16 @@ from numpy.typing import NDArray
 
 from astratag.codes import Reading
 from astratag.dictionary import Dictionary
-from astratag.geometry import CELLS, DRAWN_OFFSET, LAYERS, QUIET_MARGIN, TEMPLATE_UNITS, cell_polygons, layer_points
+from astratag.geometry import (
+    CELLS,
+    DRAWN_OFFSET,
+    LAYERS,
+    QUIET_MARGIN,
+    TEMPLATE_UNITS,
+    cell_polygons,
+    layer_points,
+    square,
+)
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -57,6 +67,10 @@ def _smooth(points: Array) -> Array:
 CELL_SAMPLES = _cell_samples()
 ALWAYS_BLACK = _always_black()
 SAMPLES = np.concatenate([CELL_SAMPLES.reshape(-1, 2), ALWAYS_BLACK])
+BLUR_UNITS = (0.0, 60.0, 120.0)
+"""Widths of box blurs, template units, at which codes are known: what small squares look like."""
+PIXEL_BLUR = 2.8
+"""Width in pixels of the box blur that is like a lens's and a pixel's together (sigma 0.8)."""
 _ILLUMINATION = _smooth(CELL_SAMPLES.mean(axis=1)) @ np.linalg.pinv(_smooth(ALWAYS_BLACK))
 """Takes the always-black samples (B,) to the black level at the cells (48,)."""
 
@@ -67,14 +81,17 @@ class Codebook:
     def __init__(self, dictionary: Dictionary) -> None:
         self.dictionary = dictionary
         codes = dictionary.oriented.reshape(-1, CELLS).astype(float)
-        codes -= codes.mean(axis=1, keepdims=True)
-        self._unit_codes = codes / np.linalg.norm(codes, axis=1, keepdims=True)
+        self._unit_codes = [unit(codes @ mixing.T + around) for mixing, around in _mixings()]
 
-    def read(self, cells: Array) -> list[Reading]:
-        """Return the best reading of each row of cells (Q, 48)."""
+    def read(self, cells: Array, side_px: Array | None = None) -> list[Reading]:
+        """Return the best reading of each row of cells (Q, 48); ``side_px`` (Q,) is how large each square looks."""
         if len(cells) == 0:
             return []
-        correlations = np.einsum("qc,kc->qk", unit(cells), self._unit_codes)
+        levels = np.zeros(len(cells), dtype=int) if side_px is None else blur_level(side_px)
+        correlations = np.empty((len(cells), len(self._unit_codes[0])))
+        for level in np.unique(levels):
+            rows = levels == level
+            correlations[rows] = np.einsum("qc,kc->qk", unit(cells[rows]), self._unit_codes[level])
         best = correlations.argmax(axis=1)
         wrong = hamming(cells, self.dictionary.oriented.reshape(-1, CELLS)[best])
         return [
@@ -82,11 +99,36 @@ class Codebook:
             for q, b in enumerate(best)
         ]
 
-    def read_as(self, cells: Array, marker_id: int) -> Reading:
-        """Return how well cells (48,) fit an upright marker of a known identity."""
+    def read_as(self, cells: Array, marker_id: int, side_px: float = np.inf) -> Reading:
+        """Return how well cells (48,) fit an upright marker of a known identity that looks ``side_px`` large."""
         row = self.dictionary.ids.index(marker_id)
-        correlation = float(unit(cells[None])[0] @ self._unit_codes[4 * row])
+        codes = self._unit_codes[int(blur_level(np.array(side_px)))]
+        correlation = float(unit(cells[None])[0] @ codes[4 * row])
         return Reading(marker_id, 0, correlation, int(hamming(cells[None], self.dictionary.signatures[row][None])[0]))
+
+
+def blur_level(side_px: Array) -> NDArray[np.int64]:
+    """Return which of ``BLUR_UNITS`` is nearest to what a square ``side_px`` large looks like."""
+    width = PIXEL_BLUR * TEMPLATE_UNITS / np.maximum(side_px, 1.0)
+    return np.abs(np.asarray(width)[..., None] - BLUR_UNITS).argmin(axis=-1)
+
+
+@lru_cache(maxsize=1)
+def _mixings() -> tuple[tuple[Array, Array], ...]:
+    """Return, for each of ``BLUR_UNITS``, what cells see of each cell's white (48, 48), and of the margin's (48,)."""
+    scale, margin = 0.5, QUIET_MARGIN * TEMPLATE_UNITS
+    at = (SAMPLES + margin)[None] * scale - 0.5
+    pictures = np.zeros((CELLS + 1, *(round((TEMPLATE_UNITS + 2 * margin) * scale),) * 2), np.uint8)
+    pictures[CELLS] = 255
+    shapes = (*(cell_polygons() + DRAWN_OFFSET), square(0.0, TEMPLATE_UNITS))
+    for picture, polygon, level in zip(pictures, shapes, [255] * CELLS + [0], strict=True):
+        cv2.fillPoly(picture, [np.round(((polygon + margin) * scale - 0.5) * 16).astype(np.int32)], level, shift=4)
+    mixings = [(np.eye(CELLS), np.zeros(CELLS))]
+    for width in BLUR_UNITS[1:]:
+        blurred = (cv2.blur(picture, (round(width * scale),) * 2) for picture in pictures)
+        seen = np.concatenate([cell_values(picture, at) for picture in blurred]) / 255.0
+        mixings.append((seen[:CELLS].T, seen[CELLS]))
+    return tuple(mixings)
 
 
 def unit(cells: Array) -> Array:
@@ -136,23 +178,26 @@ class Artwork:
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
-        self._expected: dict[int, Array] = {}
+        self._expected: dict[tuple[int, float], Array] = {}
         span = np.linspace(-self.REACH, 1 + self.REACH, self.GRID) * TEMPLATE_UNITS
         self.points = np.stack(np.meshgrid(span, span), axis=-1).reshape(-1, 2)
         """Where to sample (N, 2), as if the square were the outermost."""
 
-    def expected(self, marker_id: int) -> Array:
-        """Return the print's brightness (3, N) at ``points`` for each layer the square may be."""
-        if marker_id not in self._expected:
+    def expected(self, marker_id: int, side_px: float = np.inf) -> Array:
+        """Return the print's brightness (3, N) at ``points`` for each layer the square may be, ``side_px`` large."""
+        softness = BLUR_UNITS[int(blur_level(np.array(side_px)))] / TEMPLATE_UNITS
+        key = marker_id, softness
+        if key not in self._expected:
             picture = self._picture(self._dictionary.signature(marker_id))
             sampled = []
             for layer in LAYERS:
-                spacing = layer.scale * TEMPLATE_UNITS * (1 + 2 * self.REACH) / (self.GRID - 1) / self.UNITS_PER_PIXEL
+                finest = max((1 + 2 * self.REACH) / (self.GRID - 1), softness)
+                spacing = layer.scale * TEMPLATE_UNITS * finest / self.UNITS_PER_PIXEL
                 blurred = cv2.blur(picture, (max(1, round(spacing)),) * 2)
                 at = (layer_points(self.points, layer) + QUIET_MARGIN * TEMPLATE_UNITS) / self.UNITS_PER_PIXEL - 0.5
                 sampled.append(sample(blurred, at[None])[0])
-            self._expected[marker_id] = np.array(sampled)
-        return self._expected[marker_id]
+            self._expected[key] = np.array(sampled)
+        return self._expected[key]
 
     def _picture(self, code: NDArray[np.uint8]) -> Image:
         """Return the print with its margin, a unit to the pixel."""
@@ -175,11 +220,11 @@ class Artwork:
                 fill(layer_points(cell, layer), 255)
         return picture
 
-    def likeness(self, gray: Image, warp: Warp, marker_id: int) -> float:
+    def likeness(self, gray: Image, warp: Warp, marker_id: int, side_px: float = np.inf) -> float:
         """Return the correlation of a whole print with the image seen through its warp."""
-        return float(self.layer_scores(gray, warp, marker_id)[0])
+        return float(self.layer_scores(gray, warp, marker_id, side_px)[0])
 
-    def layer_scores(self, gray: Image, square_warp: Warp, marker_id: int) -> Array:
+    def layer_scores(self, gray: Image, square_warp: Warp, marker_id: int, side_px: float = np.inf) -> Array:
         """Return how well (3,) the surroundings of a square fit it being layer 0, 1 or 2, as correlations.
 
         ``square_warp`` takes the template to the image as if the square were the outermost.
@@ -191,4 +236,4 @@ class Artwork:
         if inside.sum() < 16:
             return np.zeros(len(LAYERS))
         seen = unit(sample(gray, at[None, inside]))[0]
-        return unit(self.expected(marker_id)[:, inside]) @ seen
+        return unit(self.expected(marker_id, side_px)[:, inside]) @ seen

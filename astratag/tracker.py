@@ -14,7 +14,7 @@ from astratag.detection import Detection
 from astratag.detector import HALVE_FROM_PX, Detector, View, surest
 from astratag.fit import fit_edges
 from astratag.grow import ALL_EDGES, SETTLED_PX, Fit, grow, settle
-from astratag.search import find_quads
+from astratag.search import COARSE, PLAIN, find_outlines
 from astratag.surface import Flat
 from astratag.transforms import difference, perturb
 from astratag.warp import FittedWarp, HomographyWarp, PoseWarp
@@ -23,13 +23,14 @@ Array = NDArray[np.float64]
 
 SEARCH_EVERY = 10
 """Frames between searches of the whole image for markers not yet tracked."""
-TRACK_PX = 6.0
-"""How far from its prediction an edge may be."""
+STEADY_PX, TRACK_PX = 3.0, 6.0
+"""How far from its prediction an edge may be when the marker moves on as before, and when it does not."""
 COST_LIMIT = 1.0
 """Mean truncated squared residual (of 9 at most) above which a followed fit is not believed."""
 LEAST_BOX_PX = 16
-LOCAL_MARGIN = 0.5
-"""How much wider than the marker, on each side as a fraction of its size, a local search looks."""
+FIT_MARGIN, LOCAL_MARGIN = 0.15, 0.5
+"""How much wider than the marker, on each side as a fraction of its size, a fit and a local search look."""
+FIT_MARGIN_PX = TRACK_PX + 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,50 +91,63 @@ class Tracker:
 
     def _follow_all(self, image: NDArray[np.uint8], camera: Camera) -> tuple[list[Detection], dict[int, Array]]:
         """Return the tracked markers still seen, and for each (by Python's id) its pose in the last frame."""
-        boxes = [self._box(track, camera) for track in self._tracks]
+        around = [self._around(track, camera) for track in self._tracks]
+        boxes = [_box(corners, FIT_MARGIN, FIT_MARGIN_PX, camera) for corners in around]
         view = self.detector.view(image, camera, [box for box in boxes if box is not None])
         found: list[Detection] = []
         before: dict[int, Array] = {}
-        for track, box in zip(self._tracks, boxes, strict=True):
-            seen = None if box is None else self._follow(view, track, box)
+        for track, corners, box in zip(self._tracks, around, boxes, strict=True):
+            seen = None if box is None else self._follow(view, track) or self._search_near(view, track, corners)
             if seen is not None:
                 found.append(seen)
                 before[id(seen)] = track.T_cam_marker
         return surest(found), before
 
-    def _box(self, track: Track, camera: Camera) -> NDArray[np.int64] | None:
-        """Return the part of the image (2, 2) a tracked marker should be in, low and high x, y; None when out of it."""
+    def _around(self, track: Track, camera: Camera) -> Array:
+        """Return where the corners (4 N, 2) of a tracked marker may be."""
         spec = self.detector.spec(track.marker_id)
         surface = spec.surface or Flat()
-        around = np.concatenate([PoseWarp(camera, spec.side_m, surface, T)(OUTER) for T in track.predictions])
-        margin = LOCAL_MARGIN * (around.max(axis=0) - around.min(axis=0))
-        box = np.stack([around.min(axis=0) - margin, around.max(axis=0) + margin])
-        box = np.clip(box, 0, (camera.width, camera.height)).astype(int)
-        return box if (box[1] - box[0]).min() >= LEAST_BOX_PX else None
+        return np.concatenate([PoseWarp(camera, spec.side_m, surface, T)(OUTER) for T in track.predictions])
 
-    def _follow(self, view: View, track: Track, box: NDArray[np.int64]) -> Detection | None:
-        """Return a tracked marker where it is predicted, or near there; None when it is lost."""
-        for T_cam_marker in track.predictions:
-            fit = self._fit_near(view, track.marker_id, T_cam_marker)
+    def _follow(self, view: View, track: Track) -> Detection | None:
+        """Return a tracked marker where it is predicted; None when it is not there."""
+        steady = [(track.predictions[0], STEADY_PX)] if len(track.predictions) > 1 else []
+        for T_cam_marker, search_px in [*steady, *((T, TRACK_PX) for T in track.predictions)]:
+            fit = self._fit_near(view, track.marker_id, T_cam_marker, search_px)
             if fit is not None and fit.cost < COST_LIMIT:
                 detection = self.detector.describe(view, track.marker_id, fit, "tracked")
                 if detection is not None:
                     return detection
-        return self._search_near(view, track, box)
+        return None
 
-    def _fit_near(self, view: View, marker_id: int, T_cam_marker: Array) -> Fit | None:
+    def _fit_near(self, view: View, marker_id: int, T_cam_marker: Array, search_px: float) -> Fit | None:
         """Return the fit to all edges around a predicted pose."""
         spec = self.detector.spec(marker_id)
         assert view.camera is not None
         warp: FittedWarp = PoseWarp(view.camera, spec.side_m, spec.surface or Flat(), T_cam_marker)
         if spec.surface is None:
             return grow(view.light, HomographyWarp.from_points(OUTER, warp(OUTER)), 0)
-        fit = fit_edges(view.light, warp, ALL_EDGES, TRACK_PX, sharp_only=True)
+        fit = fit_edges(view.light, warp, ALL_EDGES, search_px, sharp_only=True)
         return fit if fit is None or fit.moved_px < SETTLED_PX else settle(view.light, fit.warp)
 
-    def _search_near(self, view: View, track: Track, box: NDArray[np.int64]) -> Detection | None:
-        """Return a lost marker from a search of the part of the image it should be in."""
+    def _search_near(self, view: View, track: Track, around: Array) -> Detection | None:
+        """Return a lost marker from a search of the part of the image around the corners (4 N, 2) it should have."""
+        assert view.camera is not None
+        box = _box(around, LOCAL_MARGIN, FIT_MARGIN_PX, view.camera)
+        if box is None:
+            return None
+        view = self.detector.view(view.gray, view.camera, [box])
         (left, top), (right, bottom) = box
         part = view.gray[top:bottom, left:right]
-        found, _ = self.detector.search(view, find_quads(part, halve=part.size > HALVE_FROM_PX) + box[0])
+        found = self.detector.search(
+            view, find_outlines(part, COARSE if part.size > HALVE_FROM_PX else PLAIN).moved(box[0])
+        )
         return next((seen for seen in found if seen.marker_id == track.marker_id), None)
+
+
+def _box(around: Array, margin: float, margin_px: float, camera: Camera) -> NDArray[np.int64] | None:
+    """Return the part of the image (2, 2) about points (N, 2), low and high x, y; None when hardly any is in it."""
+    low, high = around.min(axis=0), around.max(axis=0)
+    wider = margin * (high - low) + margin_px
+    box = np.clip(np.stack([low - wider, high + wider]), 0, (camera.width, camera.height)).astype(int)
+    return box if (box[1] - box[0]).min() >= LEAST_BOX_PX else None

@@ -6,6 +6,8 @@ child's axes, metres then radians: T = T_hat * [Exp(theta), rho], xi = (rho, the
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +18,8 @@ Array = NDArray[np.float64]
 
 def pose(R_a_b: ArrayLike, t_a_b_m: ArrayLike) -> Array:
     """Return T_a_b (4, 4) from a rotation (3, 3) and a translation (3,)."""
-    T = np.eye(4)
+    T = np.zeros((4, 4))
+    T[3, 3] = 1.0
     T[:3, :3] = R_a_b
     T[:3, 3] = np.asarray(t_a_b_m, dtype=float).reshape(3)
     return T
@@ -40,7 +43,10 @@ def exp_so3(theta_rad: ArrayLike) -> Array:
 
 def log_so3(R_a_b: Array) -> Array:
     """Return the rotation vector (3,) of a rotation, its angle in [0, pi]."""
-    return Rotation.from_matrix(R_a_b).as_rotvec()
+    w, *v = wxyz_from_rotation(R_a_b).tolist()
+    length = math.hypot(*v)
+    scale = 2.0 * math.atan2(length, w) / length if length > 1e-12 else 2.0  # w is 1 there
+    return np.array([scale * v[0], scale * v[1], scale * v[2]])
 
 
 def skew(v: ArrayLike) -> Array:
@@ -64,8 +70,21 @@ def difference(T_a_b: Array, T_a_b_hat: Array) -> Array:
 
 
 def wxyz_from_rotation(R_a_b: Array) -> Array:
-    """Return the unit quaternion (w, x, y, z), w >= 0."""
-    return Rotation.from_matrix(R_a_b).as_quat(canonical=True, scalar_first=True)
+    """Return the unit quaternion (w, x, y, z), w >= 0.
+
+    By the largest of its components, so that none is divided by a small one (Shepperd, 1978).
+    """
+    (a, b, c), (d, e, f), (g, h, i) = np.asarray(R_a_b, dtype=float).tolist()
+    columns = (
+        (1 + a + e + i, h - f, c - g, d - b),
+        (h - f, 1 + a - e - i, b + d, c + g),
+        (c - g, b + d, 1 - a + e - i, f + h),
+        (d - b, c + g, f + h, 1 - a - e + i),
+    )
+    largest = max(range(4), key=lambda k: columns[k][k])
+    q = columns[largest]
+    scale = math.copysign(1 / math.hypot(*q), q[0])
+    return np.array(q) * scale
 
 
 def rotation_from_wxyz(rotation_wxyz: ArrayLike) -> Array:

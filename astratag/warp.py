@@ -7,6 +7,7 @@ pixel.  Three are fitted to edges: a homography, a homography with a bend, and a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol, Self
 
 import cv2
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from astratag.camera import Camera
 from astratag.geometry import TEMPLATE_UNITS, print_from_template
 from astratag.surface import Flat, Surface
-from astratag.transforms import perturb, transform
+from astratag.transforms import perturb
 
 Array = NDArray[np.float64]
 
@@ -156,6 +157,22 @@ class BentWarp:
         return warp
 
 
+def on_surface(surface: Surface, side_m: float, template: Array) -> tuple[Array, Array]:
+    """Return the points and outward normals (3, N) in the marker frame of template points (..., 2); not to be changed.
+
+    They are kept, because the same few sets of points are projected in every frame.
+    """
+    return _on_surface(surface, side_m, np.asarray(template, dtype=float).tobytes())
+
+
+@lru_cache(maxsize=64)
+def _on_surface(surface: Surface, side_m: float, template: bytes) -> tuple[Array, Array]:
+    on_print = print_from_template(np.frombuffer(template).reshape(-1, 2), side_m)
+    points, normals = (np.ascontiguousarray(of(on_print).T) for of in (surface.points, surface.normals))
+    points.flags.writeable = normals.flags.writeable = False
+    return points, normals
+
+
 @dataclass(frozen=True, eq=False)
 class PoseWarp:
     """A print of known size on a known surface at ``T_cam_marker``, seen by a calibrated camera."""
@@ -165,26 +182,35 @@ class PoseWarp:
     surface: Surface
     T_cam_marker: Array
 
-    def _points_marker(self, template: Array) -> Array:
-        return self.surface.points(print_from_template(template, self.side_m))
+    def _marker(self, template: Array) -> tuple[Array, Array]:
+        """Return points and outward normals (3, N) in the marker frame."""
+        return on_surface(self.surface, self.side_m, template)
+
+    def _cam(self, points_marker: Array) -> Array:
+        """Return points (3, N) of the marker frame in the camera's."""
+        return self.T_cam_marker[:3, :3] @ points_marker + self.T_cam_marker[:3, 3:]
 
     def __call__(self, template: Array) -> Array:
         """Return pixels (..., 2)."""
-        points_cam = transform(self.T_cam_marker, self._points_marker(template)).reshape(-1, 3)
-        in_front = points_cam[:, 2] > 1e-3 * self.side_m
-        at = self.camera.project(np.where(in_front[:, None], points_cam, (0.0, 0.0, 1.0)))
-        return np.where(in_front[:, None], at, OUTSIDE_PX).reshape(*np.shape(template)[:-1], 2)
+        points_cam = self._cam(self._marker(template)[0])
+        behind = points_cam[2] <= 1e-3 * self.side_m
+        if not behind.any():
+            return self.camera.project(points_cam.T).reshape(np.shape(template))
+        points_cam[:, behind] = ((0.0,), (0.0,), (1.0,))
+        at = self.camera.project(points_cam.T)
+        at[behind] = OUTSIDE_PX
+        return at.reshape(np.shape(template))
 
     def jacobian(self, template: Array) -> Array:
         """Return the derivative (N, 2, 6) by a right perturbation of the pose, metres then radians."""
-        points_marker = self._points_marker(template)
-        R_cam_marker = self.T_cam_marker[:3, :3]
-        by_point = self.camera.projection_jacobian(transform(self.T_cam_marker, points_marker))
-        by_rho = by_point @ R_cam_marker
-        x, y, z = (points_marker[:, axis, None] for axis in range(3))
-        gx, gy, gz = (by_rho[:, :, axis] for axis in range(3))
-        by_theta = np.stack([y * gz - z * gy, z * gx - x * gz, x * gy - y * gx], axis=2)  # g . (theta x X)
-        return np.concatenate([by_rho, by_theta], axis=2)
+        points_marker = self._marker(template)[0]
+        by_point = self.camera.projection_jacobian(self._cam(points_marker).T).transpose(1, 2, 0)
+        J = np.empty((2, 6, points_marker.shape[1]))
+        J[:, :3] = self.T_cam_marker[:3, :3].T @ by_point
+        x, y, z = points_marker
+        gx, gy, gz = J[:, 0], J[:, 1], J[:, 2]
+        J[:, 3], J[:, 4], J[:, 5] = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx  # g . (theta x X)
+        return J.transpose(2, 0, 1)
 
     def stepped(self, delta: Array) -> PoseWarp:
         """Return the pose perturbed."""
@@ -195,11 +221,10 @@ class PoseWarp:
         if not self.curved:
             facing = -(self.T_cam_marker[:3, 3] @ self.T_cam_marker[:3, 2])  # distance from the plane
             return np.full(len(template), facing > GRAZING_COSINE * np.linalg.norm(self.T_cam_marker[:3, 3]))
-        on_print = print_from_template(template, self.side_m)
-        points_cam = transform(self.T_cam_marker, self.surface.points(on_print))
-        normals_cam = self.surface.normals(on_print) @ self.T_cam_marker[:3, :3].T
-        towards = -(points_cam * normals_cam).sum(axis=1) / np.maximum(np.linalg.norm(points_cam, axis=1), 1e-12)
-        return (towards > GRAZING_COSINE) & (points_cam[:, 2] > 0)
+        points_marker, normals_marker = self._marker(template)
+        points_cam = self._cam(points_marker)
+        towards = -(points_cam * (self.T_cam_marker[:3, :3] @ normals_marker)).sum(axis=0)
+        return (towards > GRAZING_COSINE * np.sqrt((points_cam * points_cam).sum(axis=0))) & (points_cam[2] > 0)
 
     def step_sigma(self) -> Array:
         """Return no limits (6,)."""

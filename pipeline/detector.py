@@ -105,8 +105,10 @@ def _add_points(message: ImageAnnotations, kind: int, points_px: NDArray[np.floa
     annotation = message.points.add(type=kind, thickness=LINE_PX if kind == PointsAnnotation.LINE_LOOP else LINE_PX / 2)
     annotation.timestamp.CopyFrom(message.timestamp)
     annotation.outline_color.CopyFrom(_color(color))
+    add = annotation.points.add
     for x, y in points_px.tolist():
-        annotation.points.add(x=x, y=y)
+        point = add()  # filled in after: twice as fast as by keywords
+        point.x, point.y = x, y
 
 
 def _add_grid(message: ImageAnnotations, grid_px: NDArray[np.float64]) -> None:

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astratag.camera import Camera
-from astratag.geometry import CELLS, TEMPLATE_UNITS
+from astratag.geometry import CELLS
 from astratag.surface import Cylinder, Flat, Surface
 from astratag.transforms import inverse, transform
-from pipeline.texture import PRINT_UNITS, Image, print_texture
+from pipeline.texture import Image, Texture, print_texture
 
 Array = NDArray[np.float64]
 Encoding = Literal["srgb", "linear"]
@@ -85,11 +85,23 @@ def render_marker(
 
     Raises ValueError when a size or a shape is impossible.
     """
-    levels = np.broadcast_to(np.asarray(background, dtype=np.float32), (camera.height, camera.width)) / np.float32(255)
-    light = linear_from_srgb(levels) if encoding == "srgb" else levels
+    light = light_behind(camera, background, encoding)
     light = lay_print(
         light, camera, T_cam_marker, signature=signature, side_m=side_m, surface=surface or Flat(), samples=samples
     )
+    return develop(light, blur_px=blur_px, noise_sigma=noise_sigma, seed=seed, encoding=encoding)
+
+
+def light_behind(camera: Camera, background: float | NDArray[np.uint8], encoding: Encoding = "srgb") -> Image:
+    """Return the linear light (height, width) of a grey level or picture (height, width)."""
+    levels = np.broadcast_to(np.asarray(background, dtype=np.float32), (camera.height, camera.width)) / np.float32(255)
+    return linear_from_srgb(levels) if encoding == "srgb" else levels
+
+
+def develop(
+    light: Image, *, blur_px: float = 0.8, noise_sigma: float = 2.0, seed: int = 0, encoding: Encoding = "srgb"
+) -> NDArray[np.uint8]:
+    """Return the gray picture a camera makes of linear light (height, width): blur, encoding, noise, rounding."""
     if blur_px > 0:
         light = cv2.GaussianBlur(light, (0, 0), blur_px, borderType=cv2.BORDER_REPLICATE)
     code = (srgb_from_linear(light) if encoding == "srgb" else np.clip(light, 0, 1)) * np.float32(255)
@@ -108,7 +120,7 @@ def lay_print(
     surface: Surface,
     samples: int = 8,
 ) -> Image:
-    """Return the linear picture ``light`` (height, width) with an evenly lit print over it, edges exact.
+    """Return the linear picture ``light`` (height, width) with an evenly lit marker print over it, edges exact.
 
     Arguments as for ``render_marker``.  Raises ValueError when a size or a shape is impossible.
     """
@@ -116,20 +128,29 @@ def lay_print(
         raise ValueError(f"signature must be the {CELLS} bits of one marker, got shape {np.shape(signature)}")
     if not side_m > 0:
         raise ValueError(f"side_m must be a positive side in metres, got {side_m}")
+    return lay_texture(light, camera, T_cam_marker, print_texture(signature, side_m), surface, samples)
+
+
+def lay_texture(
+    light: Image, camera: Camera, T_cam_print: Array, texture: Texture, surface: Surface, samples: int = 8
+) -> Image:
+    """Return the linear picture ``light`` (height, width) with any square print over it, evenly lit, edges exact.
+
+    ``texture`` is 0 where there is ink and 1 where the print is white; ``samples`` the rays a pixel.
+    """
     light = np.array(light, np.float32)
-    half_m = side_m * PRINT_UNITS / TEMPLATE_UNITS / 2
+    half_m = texture.width_m / 2
     grid = np.linspace(-half_m, half_m, 33)
     enclosing = surface.points(np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2))
-    window = window_of(camera, transform(T_cam_marker, enclosing))
+    window = window_of(camera, transform(T_cam_print, enclosing))
     if window is None:
         return light
-    texture = print_texture(signature, side_m)
     rays, right, down = (part[window] for part in pixel_rays(camera))
     behind = light[window].copy()
     total = np.zeros_like(behind)
-    T_marker_cam = inverse(T_cam_marker)
+    T_print_cam = inverse(T_cam_print)
     for dx, dy in ray_lattice(samples):
-        x, y, stretch, seen = _hit_print(surface, T_marker_cam, rays + dx * right + dy * down)
+        x, y, stretch, seen = _hit_print(surface, T_print_cam, rays + dx * right + dy * down)
         if not seen.any():
             total += behind
             continue

@@ -1,0 +1,155 @@
+# ruff: noqa: E402
+"""Run the detection benchmark: tables on the console, ``results.json`` and figures in ``out/detection``.
+
+Everything is seeded; the seeds are printed and saved.  Times are CPU milliseconds of one thread: BLAS and OpenCV are
+held to one, and so are the peers.
+"""
+
+from __future__ import annotations
+
+import os
+
+for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_variable, "1")
+
+import argparse
+import json
+import multiprocessing
+import platform
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
+from rich.table import Table
+
+from benchmarks.detection.cost import measure_cost
+from benchmarks.detection.false_accepts import FIRST_SEED, measure_false_accepts
+from benchmarks.detection.figures import draw_condition, draw_cost, rows_of
+from benchmarks.detection.peers import ENTRANTS, TRACKED, Entrant
+from benchmarks.detection.recall import SIZES, measure
+from benchmarks.detection.scenes import CONDITIONS, Condition
+
+REAL_FRAMES = Path(__file__).resolve().parents[3] / "shared" / "reference" / "frames"
+PARTS = (*(condition.name for condition in CONDITIONS), "cost", "false-accepts")
+CONSOLE = Console(width=200)
+
+
+def recall(
+    conditions: Sequence[Condition], images: int, processes: int, entrants: tuple[Entrant, ...]
+) -> Iterator[tuple[Condition, list[dict]]]:
+    """Yield each condition with its rows as soon as all its cells are measured, by several processes."""
+    if not conditions:
+        return
+    names = tuple(entrant.name for entrant in entrants)
+    rows: dict[str, list[dict]] = {condition.name: [] for condition in conditions}
+    context = multiprocessing.get_context("spawn")
+    with (
+        ProcessPoolExecutor(processes, mp_context=context) as pool,
+        Progress(*Progress.get_default_columns(), MofNCompleteColumn(), TimeElapsedColumn(), console=CONSOLE) as bar,
+    ):
+        jobs = {pool.submit(measure, c.name, value, images, names): c for c in conditions for value in c.values}
+        left = Counter(condition.name for condition in jobs.values())
+        for job in bar.track(as_completed(jobs), len(jobs), description=f"recall, {images} images a cell"):
+            condition = jobs[job]
+            rows[condition.name] += job.result()
+            left[condition.name] -= 1
+            if not left[condition.name]:
+                yield condition, rows[condition.name]
+
+
+def show_condition(condition: Condition, rows: Sequence[dict], entrants: Iterable[Entrant]) -> None:
+    """Print an entrant's per cent found, wrong and misplaced readings and corner error, a line for each size."""
+    seeds = sorted({(row["value"], row["first_seed"]) for row in rows if row["condition"] == condition.name})
+    table = Table(title=f"{condition.name}: {condition.label}", title_justify="left", box=None)
+    table.add_column("found, % !wrong ?misplaced (corner RMS, px)", no_wrap=True)
+    for value in condition.values:
+        table.add_column(f"{value:g}", justify="right", no_wrap=True)
+    for size in SIZES:
+        for entrant in entrants:
+            mine = rows_of(rows, condition.name, entrant.name, size)
+            if size == SIZES[0] or mine[0]["size"] == size:
+                table.add_row(f"{entrant.name} ({size})", *(cell_text(row) for row in mine))
+    if condition.asked:
+        table.add_row("asked of AstraTag", *(f"{condition.asked.get(value, ''):}" for value in condition.values))
+    CONSOLE.print(table)
+    CONSOLE.print(f"first seeds: {', '.join(f'{value:g}: {seed}' for value, seed in seeds)}\n", style="dim")
+
+
+def cell_text(row: dict) -> str:
+    """Return one cell of the table."""
+    wrong = (f"!{row['wrong']} " if row["wrong"] else "") + (f"?{row['misplaced']} " if row["misplaced"] else "")
+    corner = f" ({row['corner_rms_px']:.2f})" if row["corner_rms_px"] is not None else ""
+    return f"{wrong}{100 * row['recall']:.0f}{corner}"
+
+
+def show_cost(rows: Sequence[dict]) -> None:
+    """Print CPU milliseconds a frame, and how many times those of AstraTag's search."""
+    table = Table(title="CPU ms a frame, one thread (times AstraTag's search)", title_justify="left", box=None)
+    sizes = list(dict.fromkeys(row["image"] for row in rows))
+    table.add_column("")
+    for size in sizes:
+        table.add_column(size, justify="right")
+    for name in dict.fromkeys(row["entrant"] for row in rows):
+        mine = {row["image"]: row for row in rows if row["entrant"] == name}
+        cells = (f"{mine[size]['cpu_ms']:.2f} ({mine[size]['of_astratag']:.2f}x)" for size in sizes)
+        table.add_row(name, *cells)
+    CONSOLE.print(table)
+
+
+def show_false_accepts(result: dict) -> None:
+    """Print who saw markers where there were none."""
+    CONSOLE.print(
+        f"\nFalse accepts: {result['candidates']} candidates in {result['frames']} pictures without a marker, from "
+        f"{len(result['textures'])} textures, first seed {FIRST_SEED}.  Counted: {result['counted']}."
+    )
+    for row in result["entrants"]:
+        CONSOLE.print(f"  {row['entrant']:28} {row['reports']}")
+
+
+def save(results: dict[str, object], folder: Path) -> Path:
+    """Write what there is so far, and return where."""
+    path = folder / "results.json"
+    path.write_text(json.dumps(results, indent=1) + "\n")
+    return path
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.detection", description=__doc__)
+    parser.add_argument("--images", type=int, default=50, help="images a cell (50)")
+    parser.add_argument("--candidates", type=int, default=100_000, help="false-accept candidates (100000)")
+    parser.add_argument("--only", default=",".join(PARTS), help=f"parts, of {','.join(PARTS)}")
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--textures", type=Path, default=REAL_FRAMES if REAL_FRAMES.is_dir() else None)
+    parser.add_argument("--out", type=Path, default=Path("out/detection"))
+    options = parser.parse_args()
+    parts = options.only.split(",")
+    if unknown := set(parts) - set(PARTS):
+        parser.error(f"--only: no part is called {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}")
+    entrants = tuple(entrant for entrant in ENTRANTS if not entrant.absent)
+    for entrant in ENTRANTS:
+        if entrant.absent:
+            CONSOLE.print(f"{entrant.name}: left out, {entrant.needs} is not installed (uv sync --extra peers)")
+    options.out.mkdir(parents=True, exist_ok=True)
+    results: dict[str, object] = {"machine": platform.processor() or platform.machine(), "images": options.images}
+    conditions = [condition for condition in CONDITIONS if condition.name in parts]
+    if "cost" in parts:
+        results["cost"] = cost = measure_cost(options.images, (*entrants, TRACKED))
+        show_cost(cost)
+        draw_cost(cost, options.out)
+    results["recall"] = measured = []
+    for condition, rows in recall(conditions, options.images, options.processes, entrants):
+        show_condition(condition, rows, entrants)
+        draw_condition(condition, rows, options.out)
+        measured += rows
+        save(results, options.out)
+    if "false-accepts" in parts:
+        results["false_accepts"] = accepts = measure_false_accepts(options.candidates, options.textures, entrants)
+        show_false_accepts(accepts)
+    CONSOLE.print(f"saved in {save(results, options.out)}")
+
+
+if __name__ == "__main__":
+    main()

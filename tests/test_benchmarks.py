@@ -1,0 +1,70 @@
+"""A cell of every kind of the detection benchmark runs, and its peers' artwork and corners are where they should be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.detection.cost import measure_cost
+from benchmarks.detection.false_accepts import measure_false_accepts
+from benchmarks.detection.figures import draw_condition, draw_cost
+from benchmarks.detection.peers import ENTRANTS, MARKERS, TRACKED, Entrant, texture
+from benchmarks.detection.recall import SIZES, measure, wilson
+from benchmarks.detection.scenes import CONDITIONS, SHEET_M, Scene, draw
+
+SEED = 5
+QUICK = tuple(entrant for entrant in ENTRANTS if entrant.needs in ("astratag", "cv2"))
+EASY = Scene(side_px=150, tilt_deg=(0, 20))
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("entrant", ENTRANTS, ids=lambda entrant: entrant.name)
+def test_reads_its_own_print_where_it_was_laid(entrant: Entrant, size: str):
+    if entrant.absent:
+        pytest.skip(f"{entrant.needs} is not installed; uv sync --extra peers")
+    kind, scene = MARKERS[entrant.marker], draw(EASY, SEED)
+    printed = 3 % kind.ids
+    seen = entrant.start(scene.surface)(scene.photograph(texture(entrant.marker, printed, size)), scene.camera)
+    truth = kind.corners(printed, size)
+    assert seen
+    for identity, corners in seen:
+        assert np.abs(corners - scene.pixels(truth[identity])).max() < 1.5
+
+
+def test_sheets_are_as_wide_as_astratags_on_equal_area():
+    assert {kind.sheet_m("equal") for kind in MARKERS.values()} == {SHEET_M}
+    assert MARKERS["AstraTag"].sheet_m("nominal") == pytest.approx(SHEET_M)
+    assert MARKERS["tagCustom48h12"].sheet_m("nominal") == pytest.approx(0.1667, abs=1e-4)
+
+
+@pytest.mark.parametrize("condition", CONDITIONS, ids=lambda condition: condition.name)
+def test_a_cell_of_each_condition(condition, tmp_path):
+    rows = measure(condition.name, condition.values[0], 2, [entrant.name for entrant in QUICK])
+    assert {row["entrant"] for row in rows} == {entrant.name for entrant in QUICK}
+    for row in rows:
+        assert row["images"] == 2
+        assert row["recall_95"][0] <= row["recall"] <= row["recall_95"][1]
+    assert draw_condition(condition, rows, tmp_path).stat().st_size > 0
+
+
+def test_the_same_seed_draws_the_same_picture():
+    print_ = texture("AstraTag", 3, "equal")
+    first, again, other = (draw(EASY, seed).photograph(print_) for seed in (SEED, SEED, SEED + 1))
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
+
+
+def test_cost_of_two_frames(tmp_path):
+    rows = measure_cost(2, (*QUICK, TRACKED))
+    assert all(row["cpu_ms"] > 0 and row["found"] == 2 for row in rows)
+    assert draw_cost(rows, tmp_path).stat().st_size > 0
+
+
+def test_false_accepts_count_what_the_search_proposes():
+    result = measure_false_accepts(100, None, QUICK[:1])
+    assert result["candidates"] >= 100
+    assert result["entrants"][0]["reports"] == 0
+
+
+@pytest.mark.parametrize(("found", "images", "low", "high"), [(0, 10, 0.0, 0.2775), (10, 10, 0.7225, 1.0)])
+def test_wilson_bounds_against_the_closed_form(found, images, low, high):
+    assert wilson(found, images) == pytest.approx((low, high), abs=1e-4)
