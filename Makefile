@@ -47,7 +47,7 @@ format: $(STAMP) ## Format the code
 	$(RUN)/ruff format .
 
 bench: $(STAMP) ## Run the benchmarks
-	$(RUN)/python -m benchmarks.detection
+	$(RUN)/python -m benchmarks.detection --images 10
 	$(RUN)/python -m benchmarks.filter
 	$(RUN)/python -m benchmarks.throughput
 

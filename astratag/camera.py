@@ -37,7 +37,7 @@ class Camera:
         if not np.isfinite(K).all():
             raise ValueError(f"K must be finite, got {K.tolist()}")
         if K.shape != (3, 3) or not np.allclose(K[2], (0, 0, 1)):
-            raise ValueError(f"K must be 3x3 with last row 0 0 1, got shape {K.shape}. Is it transposed?")
+            raise ValueError(f"K must be 3x3 with last row 0 0 1, got {K.tolist()}. Is it transposed?")
         if K[0, 0] <= 0 or K[1, 1] <= 0:
             raise ValueError(f"K must have positive focal lengths, got fx {K[0, 0]}, fy {K[1, 1]}")
         if max(abs(K[0, 1]), abs(K[1, 0])) > SKEW_ALLOWED * K[0, 0]:

@@ -82,6 +82,10 @@ class MarkerSpec:
     side_m: float
     surface: Surface | None = None
 
+    def __post_init__(self) -> None:
+        if self.surface is not None and not isinstance(self.surface, Surface):
+            raise ValueError(f"surface must be Flat(), Cylinder(radius_m, axis_rad) or None, got {self.surface!r}")
+
 
 @dataclass(frozen=True, eq=False)
 class View:
