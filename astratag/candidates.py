@@ -21,7 +21,7 @@ from astratag.signature import (
     cell_values,
     sample,
 )
-from astratag.tps import KNOTS
+from astratag.tps import KNOTS, ThinPlate
 from astratag.warp import BentWarp, HomographyWarp
 
 Array = NDArray[np.float64]
@@ -167,27 +167,25 @@ def _framed_bent(gray: Image, shapes: BentQuads) -> NDArray[np.bool_]:
 
 
 def _bent(gray: Image, corners_px: Array, bulges_px: Array, codebook: Codebook) -> Candidate | None:
-    """Return what one bent shape reads through the best of all shifts along its sides, None when hopeless."""
+    """Return what one bent shape reads through the best of the splines that fit it, None when hopeless."""
     right = (corners_px[1] - corners_px[0] + corners_px[2] - corners_px[3]) / 2
     down = (corners_px[3] - corners_px[0] + corners_px[2] - corners_px[1]) / 2
-    by_side, rows, columns = _BENT_SAMPLES
-    base = points_in(corners_px[None], SAMPLES)[0] + by_side @ bulges_px
+    by_side, rows, columns = _profiles(KNOTS)
+    base = points_in(corners_px[None], KNOTS)[0] + by_side @ bulges_px
     along = _SHIFTS[:, 0, None, None] * (rows[:, None] * right) + _SHIFTS[:, 1, None, None] * (columns[:, None] * down)
-    readings = codebook.read(cell_values(gray, (base + along).astype(np.float32)))
+    places = base + along
+    readings = codebook.read(cell_values(gray, (_SPLINE @ places).astype(np.float32)))
     best = max(range(len(readings)), key=lambda i: readings[i].correlation)
     if readings[best].correlation < PROMISING_BENT:
         return None
-    by_side, rows, columns = _BENT_KNOTS
-    shift = _SHIFTS[best]
-    knots_px = points_in(corners_px[None], KNOTS)[0] + by_side @ bulges_px
-    knots_px = knots_px + rows[:, None] * right * shift[0] + columns[:, None] * down * shift[1]
     turns = readings[best].quarter_turns
     order = np.roll(np.arange(len(KNOTS)).reshape(-1, 4), -turns, axis=1).ravel()  # knots come in fours, like corners
-    warp = BentWarp.from_points(KNOTS, knots_px[order])
+    warp = BentWarp.from_points(KNOTS, places[best][order])
     return Candidate(readings[best], np.roll(corners_px, -turns, axis=0), warp, bent=True)
 
 
-_BENT_SAMPLES, _BENT_KNOTS = _profiles(SAMPLES), _profiles(KNOTS)
+_SPLINE = ThinPlate(KNOTS).basis(SAMPLES)
+"""Takes the places of the knots to those of the samples: the thin-plate-spline re-warp of the paper."""
 
 
 def aligned(gray: Image, candidate: Candidate, codebook: Codebook, artwork: Artwork) -> Candidate | None:

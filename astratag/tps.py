@@ -2,12 +2,11 @@
 
 Of all smooth maps through given correspondences the thin-plate spline bends least (Bookstein, 1989).  The
 correspondences are the corners of the nested squares and the middles of the outer one's sides: the AstraTag
-paper's fallback for curved surfaces.  Where the inner squares lie is searched along bends a cylinder can make.
+paper's fallback for curved surfaces.  Where the knots
+lie is searched by ``candidates``: sides bulge as the contour does, and what is between them shifts along.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,19 +41,6 @@ class ThinPlate:
         return np.column_stack([U, np.ones(len(points)), points]) @ self._coefficients
 
 
-@dataclass(frozen=True, eq=False)
-class ThinPlateWarp:
-    """The warp that takes a thin plate's knots to ``places_px`` (K, 2)."""
-
-    plate: ThinPlate
-    places_px: Array
-
-    def __call__(self, template: Array) -> Array:
-        """Return pixels (..., 2) of template points (..., 2)."""
-        template = np.asarray(template)
-        return (self.plate.basis(template.reshape(-1, 2)) @ self.places_px).reshape(template.shape)
-
-
 def _knots() -> Array:
     outer = square(0.0, TEMPLATE_UNITS)
     middles = (outer + np.roll(outer, -1, axis=0)) / 2
@@ -65,31 +51,3 @@ def _knots() -> Array:
 
 KNOTS = _knots()
 """Correspondences (16, 2), in fours: outer corners, outer sides' middles, corners of first frame and last square."""
-
-BENDS = (-0.21, -0.14, -0.07, 0.0, 0.07, 0.14, 0.21)
-"""How far the middle of a bent print may lie from where it would if flat, as fractions of its sides."""
-
-
-def _bends() -> Array:
-    """Return, for each bend searched, how far (B, 16, 2) the knots move, in fractions of the print's two sides.
-
-    A cylinder whose axis runs along one side moves the print by d (1 - u^2), u across the axis: none at the
-    corners, most along the line through the middle.
-    """
-    u = KNOTS / (TEMPLATE_UNITS / 2) - 1.0
-    shifts = [(a, b) for a in BENDS for b in BENDS if 0 < np.hypot(a, b) < 0.25]
-    across = [1 - u[:, axis] ** 2 for axis in (0, 1)]
-    return np.array([np.outer(profile, shift) for profile in across for shift in shifts])
-
-
-BEND_SHIFTS = _bends()
-
-
-def bent_places(flat_px: Array, corners_px: Array) -> Array:
-    """Return where the knots lie (B, 16, 2) for each bend of a print whose corners (4, 2) stay in place.
-
-    ``flat_px`` (16, 2) is where they would lie were it flat.
-    """
-    right = (corners_px[1] - corners_px[0] + corners_px[2] - corners_px[3]) / 2
-    down = (corners_px[3] - corners_px[0] + corners_px[2] - corners_px[1]) / 2
-    return flat_px + BEND_SHIFTS @ np.stack([right, down])
