@@ -74,7 +74,7 @@ def looks_large(quads: Array) -> Array:
 
 def flat_candidates(gray: Image, quads: Array, codebook: Codebook) -> list[Candidate]:
     """Return the quads (Q, 4, 2) that read something like a code, the best first."""
-    quads = quads[_framed(gray, quads)] if len(quads) else quads
+    quads = framed(gray, quads)
     if len(quads) == 0:
         return []
     sides_px = looks_large(quads)
@@ -84,10 +84,12 @@ def flat_candidates(gray: Image, quads: Array, codebook: Codebook) -> list[Candi
     return [_turned(*pair) for pair in sorted(promising, key=lambda pair: -pair[0].correlation)[:MAX_CANDIDATES]]
 
 
-def _framed(gray: Image, quads: Array) -> NDArray[np.bool_]:
-    """Return which quads (Q, 4, 2) are darker inside their edges than outside, on at least three sides."""
+def framed(gray: Image, quads: Array) -> Array:
+    """Return those of quads (Q, 4, 2) that are darker inside their edges than outside, on at least three sides."""
+    if len(quads) == 0:
+        return quads
     values = sample(gray, points_in(quads, _FRAME)).reshape(len(quads), 2, 4, -1).mean(axis=3)
-    return (values[:, 0] - values[:, 1] >= LEAST_STEP_GREY).sum(axis=1) >= 3
+    return quads[(values[:, 0] - values[:, 1] >= LEAST_STEP_GREY).sum(axis=1) >= 3]
 
 
 def _frame_points() -> Array:

@@ -17,7 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astratag.camera import Camera
-from astratag.candidates import OUTER, PROMISING, SURE, Candidate, aligned, bent_candidates, flat_candidates
+from astratag.candidates import (
+    OUTER,
+    PROMISING,
+    SURE,
+    Candidate,
+    aligned,
+    bent_candidates,
+    flat_candidates,
+    framed,
+    looks_large,
+)
 from astratag.detection import Detection, LayerDetection, PlanarPose
 from astratag.dictionary import Dictionary, load_dictionary
 from astratag.edges import Transfer, inverse_transfer
@@ -25,9 +35,24 @@ from astratag.fit import measure_layers
 from astratag.geometry import LAYERS, TEMPLATE_UNITS, Layer, layer_points, square
 from astratag.grow import Fit, fit_own_edges, grow, layer_side_px, settle
 from astratag.pose import planar_poses, poses_from_square, refine_on_corners
-from astratag.search import COARSE, FAINT, NARROW, PLAIN, Outlines, bent_quads_of, find_outlines, quads_of
+from astratag.matching import match
+from astratag.search import (
+    BROAD,
+    COARSE,
+    FAINT,
+    NARROW,
+    PLAIN,
+    SLANTED,
+    THIN,
+    TINY,
+    Outlines,
+    bent_quads_of,
+    find_outlines,
+    quads_of,
+)
 from astratag.signature import ACCEPT, Artwork, Codebook, Reading, layer_cells
 from astratag.surface import Flat, Surface
+from astratag.synthesis import Synthesis
 from astratag.tps import KNOTS
 from astratag.transforms import difference
 from astratag.warp import BentWarp, FittedWarp, HomographyWarp, PoseWarp
@@ -65,6 +90,12 @@ NOTICEABLE_BEND = 0.02
 GRID_LINES = 9
 GRID = np.stack(np.meshgrid(*[np.linspace(0.0, TEMPLATE_UNITS, GRID_LINES)] * 2), axis=-1)
 """The print's regular grid (9, 9, 2), template units, rows from the top."""
+PIXEL_BLUR = 0.9
+"""Blur from which squares are matched, pixels: a good lens's, and what sampling between pixels adds."""
+SAME_SQUARE = 0.04
+"""Squares whose centres and sides differ by less than this fraction are one."""
+MAX_MATCHED = 12
+"""Squares compared with the print pixel by pixel, in one image."""
 MAX_ALIGNED = 3
 """Candidates moved until they look as they read, in one search."""
 MOVES, DAMPING = 8, 0.03
@@ -127,6 +158,7 @@ class Detector:
         self._light = np.zeros((0, 0), dtype=np.float32)
         self._codebook = Codebook(self.dictionary)
         self._artwork = Artwork(self.dictionary)
+        self._synthesis = Synthesis(self.dictionary)
 
     def detect(self, image: NDArray[np.uint8], camera: Camera | None = None) -> list[Detection]:
         """Return the markers in a gray (H, W) or BGR (H, W, 3) uint8 image, the surest first; poses need ``camera``.
@@ -149,7 +181,35 @@ class Detector:
                 found += self._search_bent(view, outlines)
             if _sure(found) or (found and how != COARSE):
                 break
+        else:
+            found += self._search_pixels(view)
         return surest(found)
+
+    def _search_pixels(self, view: View) -> list[Detection]:
+        """Return the markers whose edges or cells cannot be followed, by all their pixels; see ``matching``."""
+        tried: list[Array] = []
+        for how in (TINY, BROAD, SLANTED, THIN):
+            quads = framed(view.gray, quads_of(find_outlines(view.gray, how)))
+            fresh = [quad for quad in quads if not any(_alike(quad, before) for before in tried)]
+            fresh = fresh[: MAX_MATCHED - len(tried)]
+            tried += fresh
+            found = [seen for seen in (self._confirm_pixels(view, quad) for quad in fresh) if seen is not None]
+            if found:
+                return found
+        return []
+
+    def _confirm_pixels(self, view: View, quad: Array) -> Detection | None:
+        """Return the marker that a rough quad (4, 2) is a layer of."""
+        seen = match(self._synthesis, view.light, quad, PIXEL_BLUR)
+        if seen is None:
+            return None
+        square_px = seen.warp(SQUARES[seen.layer])
+        height, width = view.gray.shape
+        if (square_px < 0).any() or (square_px > (width - 1, height - 1)).any():
+            return None
+        wrong = self._codebook.read_as(layer_cells(view.gray, seen.warp, seen.layer), seen.marker_id).hamming
+        layers = (LayerDetection(seen.layer, square_px, seen.sigma_px(SQUARES[seen.layer])),)
+        return self._described(view, Reading(seen.marker_id, 0, seen.correlation, wrong), seen.warp, layers, "planar")
 
     def view(
         self, image: NDArray[np.uint8], camera: Camera | None, boxes: Sequence[NDArray[np.int64]] | None = None
@@ -390,6 +450,12 @@ class Detector:
                 if best.correlation >= SURE:
                     break
         return best
+
+
+def _alike(quad: Array, other: Array) -> bool:
+    """Return whether two quads (4, 2) are one square found twice."""
+    centre, sides_px = quad.mean(axis=0) - other.mean(axis=0), looks_large(np.stack([quad, other]))
+    return bool(np.abs(centre).max() < SAME_SQUARE * sides_px.min() and np.ptp(sides_px) < SAME_SQUARE * sides_px.min())
 
 
 def moved_onto(warp: PoseWarp, template: Array, points_px: Array) -> PoseWarp:

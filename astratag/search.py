@@ -20,19 +20,33 @@ Image = NDArray[np.uint8]
 class Binarisation(NamedTuple):
     """How ink is told from paper: a pixel is ink when ``offset`` grey levels below the mean of its ``window_px``."""
 
-    halve: bool = False
-    """Work at half resolution: three times faster, and squares below some 25 pixels are lost."""
+    scale: float = 1.0
+    """Work at another resolution: at half of it three times faster, and squares below some 25 pixels are lost."""
     smooth_px: int = 3
     window_px: int = 15
     offset: int = 7
+    holes: bool = False
+    """Look for holes in what is ``offset`` above the mean, instead: black squares in their margins and frames.
+
+    White then hangs together by its corners, so that a ring a pixel wide is still closed, and what the square's
+    inside looks like does not matter.
+    """
 
 
-COARSE = Binarisation(halve=True)
+COARSE = Binarisation(scale=0.5)
 PLAIN = Binarisation()
 NARROW = Binarisation(smooth_px=1, window_px=7)
 """For squares so small, or seen at such a slant, that their borders are a pixel or two wide."""
-FAINT = Binarisation(halve=True, offset=2)
+FAINT = Binarisation(scale=0.5, offset=2)
 """For pictures of low contrast."""
+BROAD = Binarisation(smooth_px=1, window_px=31, offset=15, holes=True)
+"""For blur and glare, which widen what is white."""
+TINY = Binarisation(scale=2.0, smooth_px=1, window_px=9, holes=True)
+"""For squares of some 12 to 30 pixels."""
+SLANTED = Binarisation(scale=2.0, smooth_px=1, window_px=21, offset=15, holes=True)
+"""For margins a pixel wide, of squares seen at more than 80 degrees."""
+THIN = Binarisation(scale=2.0, smooth_px=1, window_px=9)
+"""For borders a pixel wide."""
 
 POLYGON_TOLERANCES = (0.03, 0.05, 0.015, 0.08)
 """Fractions of the perimeter, most useful first; skinny quads need the small ones, bent squares the large."""
@@ -45,7 +59,8 @@ LEAST_ROUNDNESS = 0.009
 """Area over squared perimeter: 0.0625 of a square, 0.03 of one seen at 80 degrees, less of ragged shapes."""
 MAX_CONTOURS = 500
 MAX_BENT_OUTLINES = 120
-OUTSET_PX = 0.75
+OUTSET_PX, INSET_PX = 0.75, -0.5
+"""Contours run through the centres of the outermost ink pixels, or of the white pixels beside a hole."""
 LEAST_SINE = 0.1
 
 
@@ -55,6 +70,8 @@ class Outlines(NamedTuple):
     contours: list[tuple[float, NDArray[np.int32]]]
     scale: float
     origin: Array
+    outset_px: float
+    """How far out of the contour the square's edge lies, in the contour's own pixels."""
 
     def moved(self, origin: Array) -> Outlines:
         """Return the outlines of a part of an image whose first pixel is at ``origin`` (2,)."""
@@ -74,15 +91,17 @@ class BentQuads(NamedTuple):
 
 def find_outlines(gray: Image, how: Binarisation = PLAIN) -> Outlines:
     """Return the outlines of dark shapes, the longest first, at most ``MAX_CONTOURS``."""
-    if how.halve:
-        gray = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    smooth = cv2.blur(gray, (how.smooth_px,) * 2)
-    ink = cv2.adaptiveThreshold(
-        smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, how.window_px, how.offset
-    )
-    contours, _ = cv2.findContours(ink, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
+    if how.scale != 1.0:
+        interpolation = cv2.INTER_AREA if how.scale < 1 else cv2.INTER_CUBIC
+        gray = cv2.resize(gray, None, fx=how.scale, fy=how.scale, interpolation=interpolation)
+    smooth = cv2.blur(gray, (how.smooth_px,) * 2) if how.smooth_px > 1 else gray
+    kind, offset = (cv2.THRESH_BINARY, -how.offset) if how.holes else (cv2.THRESH_BINARY_INV, how.offset)
+    shapes = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, kind, how.window_px, offset)
+    contours, _ = cv2.findContours(shapes, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
+    if how.holes:
+        contours = [contour[::-1] for contour in contours]  # holes are run around the other way
     found = sorted(_plausible(contours), key=lambda outline: -outline[0])[:MAX_CONTOURS]
-    return Outlines(found, 2.0 if how.halve else 1.0, np.zeros(2))
+    return Outlines(found, 1 / how.scale, np.zeros(2), INSET_PX if how.holes else OUTSET_PX)
 
 
 def find_quads(gray: Image, how: Binarisation = PLAIN) -> Array:
@@ -93,14 +112,14 @@ def find_quads(gray: Image, how: Binarisation = PLAIN) -> Array:
 def quads_of(outlines: Outlines) -> Array:
     """Return the quads (Q, 4, 2) that outlines may be when their sides are straight."""
     quads = list(chain.from_iterable(_quads_of(contour, perimeter) for perimeter, contour in outlines.contours))
-    return outlines.in_image(_grown(np.array(quads, dtype=float).reshape(-1, 4, 2)))
+    return outlines.in_image(_grown(np.array(quads, dtype=float).reshape(-1, 4, 2), outlines.outset_px))
 
 
 def bent_quads_of(outlines: Outlines) -> BentQuads:
     """Return what outlines may be when their sides bulge: the four sharpest corners, and how they run between."""
     found = [_bent(contour, perimeter) for perimeter, contour in outlines.contours[:MAX_BENT_OUTLINES]]
     corners, bulges = (np.array([f[i] for f in found if f is not None]).reshape(-1, 4, 2) for i in (0, 1))
-    return BentQuads(outlines.in_image(_grown(corners)), outlines.scale * bulges)
+    return BentQuads(outlines.in_image(_grown(corners, outlines.outset_px)), outlines.scale * bulges)
 
 
 def _plausible(contours: Sequence[NDArray[np.int32]]) -> Iterator[tuple[float, NDArray[np.int32]]]:
@@ -114,13 +133,13 @@ def _plausible(contours: Sequence[NDArray[np.int32]]) -> Iterator[tuple[float, N
                     yield perimeter, contour
 
 
-def _grown(quads: Array) -> Array:
-    """Return quads (Q, 4, 2) with each side moved out: contours run through the centres of the outermost ink pixels."""
+def _grown(quads: Array, outset_px: float) -> Array:
+    """Return quads (Q, 4, 2) with each side moved out."""
     ahead = np.roll(quads, -1, axis=1) - quads
     along = ahead / np.maximum(np.linalg.norm(ahead, axis=2, keepdims=True), 1e-9)
     before = np.roll(along, 1, axis=1)
     sine = np.maximum(before[..., 0] * along[..., 1] - before[..., 1] * along[..., 0], LEAST_SINE)
-    return quads + OUTSET_PX * (before - along) / sine[..., None]
+    return quads + outset_px * (before - along) / sine[..., None]
 
 
 def _quads_of(contour: NDArray[np.int32], perimeter: float) -> Iterator[Array]:

@@ -10,7 +10,7 @@ Gauss-Newton step costs one look-up.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Generic, TypeVar
 
@@ -30,8 +30,8 @@ BLACK, WHITE = CELLS, CELLS + 1
 """Labels of what is always ink and always paper; cells are labelled by their number."""
 NODES = 64
 """Points that stand for the Gaussian a pixel sees through."""
-REACH = 0.07
-"""How far beyond the black square the print is looked at, as a fraction of its side."""
+REACH, LAYER_REACH = 0.07, 0.13
+"""How far beyond the black square the print is looked at, as a fraction of its side; and to tell layers apart by."""
 SPACING_PX = 0.8
 MOST_LINES, FEWEST_LINES = 44, 12
 """Grid lines across the print: so many that they are ``SPACING_PX`` apart where it looks widest, within bounds."""
@@ -91,9 +91,9 @@ _NODES, _WEIGHTS = _nodes()
 
 
 @cache
-def _grid(lines: int) -> tuple[Array, Array]:
+def _grid(lines: int, reach: float) -> tuple[Array, Array]:
     """Return template points (lines^2, 2), and them and two neighbours half a unit on (3, lines^2, 2)."""
-    span = np.linspace(-REACH, 1 + REACH, lines) * TEMPLATE_UNITS
+    span = np.linspace(-reach, 1 + reach, lines) * TEMPLATE_UNITS
     points = np.stack(np.meshgrid(span, span), axis=-1).reshape(-1, 2)
     return points, np.stack([points, points + (0.5, 0.0), points + (0.0, 0.5)])
 
@@ -127,12 +127,12 @@ class Look:
         return np.column_stack([np.ones(len(self.weight)), self.template / TEMPLATE_UNITS - 0.5])
 
 
-def look(warp: FittedWarp, shape: tuple[int, ...]) -> Look | None:
-    """Return how the print lies in an image of ``shape`` (H, W); None when hardly any of it does."""
+def look(warp: FittedWarp, shape: tuple[int, ...], reach: float = REACH) -> Look | None:
+    """Return how a print and ``reach`` sides around it lie in an image of ``shape`` (H, W); None when hardly at all."""
     corners = warp(square(0.0, TEMPLATE_UNITS))
     widest = max(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).max(), 1.0)
-    lines = int(np.clip(widest * (1 + 2 * REACH) / SPACING_PX, FEWEST_LINES, MOST_LINES))
-    points, stencil = _grid(lines)
+    lines = int(np.clip(widest * (1 + 2 * reach) / SPACING_PX, FEWEST_LINES, MOST_LINES))
+    points, stencil = _grid(lines, reach)
     at, right, below = warp(stencil.reshape(-1, 2)).reshape(3, -1, 2)
     J = 2 * np.stack([right - at, below - at], axis=2)
     determinant = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
@@ -140,7 +140,7 @@ def look(warp: FittedWarp, shape: tuple[int, ...]) -> Look | None:
     use &= warp.visible(points)
     if use.sum() < FEWEST_POINTS:
         return None
-    step = TEMPLATE_UNITS * (1 + 2 * REACH) / (lines - 1)
+    step = TEMPLATE_UNITS * (1 + 2 * reach) / (lines - 1)
     return Look(points[use], at[use], np.linalg.inv(J[use]), np.minimum(step**2 * determinant[use], 1.0))
 
 
@@ -163,6 +163,7 @@ class Synthesis:
     """The prints of a dictionary, ready to be compared with images pixel by pixel."""
 
     def __init__(self, dictionary: Dictionary) -> None:
+        self.ids = dictionary.ids
         self._dictionary = dictionary
         self._codes = dictionary.oriented.reshape(-1, CELLS).astype(float)
 
@@ -181,6 +182,21 @@ class Synthesis:
         nuisance = np.column_stack([seen.plane, share[:, :CELLS].sum(axis=1), share[:, WHITE]])
         return _correlations(seen, nuisance, _values(light, seen), share[:, :CELLS] @ self._codes.T).reshape(-1, 4)
 
+    def layer_scores(self, light: Light, square_warp: FittedWarp, marker_id: int, blur_px: float) -> Array:
+        """Return how well (3,) a square and what surrounds it fit it being layer 0, 1 or 2, as correlations.
+
+        ``square_warp`` takes the template to the image as if the square were the outermost.
+        """
+        seen = look(square_warp, light.shape, LAYER_REACH)
+        if seen is None:
+            return np.zeros(len(LAYERS))
+        picture, value = self._picture(marker_id), _values(light, seen)
+        scores = np.zeros(len(LAYERS))
+        for layer in LAYERS:
+            there = replace(seen, template=layer_points(seen.template, layer), to_template=layer.scale * seen.to_template)
+            scores[layer.index] = _contrast(seen, value, _seen_through(picture, there.places(blur_px)).mean(axis=1))[1]
+        return scores
+
     def align(self, light: Light, warp: W, marker_id: int, blur_px: float, steps: int = STEPS) -> Alignment[W] | None:
         """Return ``warp`` and the blur moved until the image looks most like a marker; None when it is lost.
 
@@ -193,8 +209,7 @@ class Synthesis:
             seen = look(warp, light.shape)
             if seen is None:
                 return None
-            brightness = cv2.remap(picture, seen.places(blur_px), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            mean, by_x, by_y, by_blur = (brightness @ _WEIGHTS).T
+            mean, by_x, by_y, by_blur = (_seen_through(picture, seen.places(blur_px)) @ _WEIGHTS).T
             value = _values(light, seen)
             contrast, correlation = _contrast(seen, value, mean)
             if contrast <= 0:
@@ -217,6 +232,11 @@ class Synthesis:
     @cache  # noqa: B019 - one picture an identity, as long as its dictionary
     def _picture(self, marker_id: int) -> Light:
         return np.append(self._dictionary.signature(marker_id), (0, 1)).astype(np.float32)[LABELS]
+
+
+def _seen_through(picture: Light, places: NDArray[np.float32]) -> Light:
+    """Return the picture's brightness (N, K) at places (N, K, 2)."""
+    return cv2.remap(picture, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def _values(light: Light, seen: Look) -> Array:
