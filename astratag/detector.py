@@ -34,8 +34,8 @@ from astratag.edges import Transfer, inverse_transfer
 from astratag.fit import measure_layers
 from astratag.geometry import LAYERS, TEMPLATE_UNITS, Layer, layer_points, square
 from astratag.grow import Fit, fit_own_edges, grow, layer_side_px, settle
-from astratag.pose import planar_poses, poses_from_square, refine_on_corners
 from astratag.matching import match
+from astratag.pose import planar_poses, poses_from_square, refine_on_corners
 from astratag.search import (
     BROAD,
     COARSE,

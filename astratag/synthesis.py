@@ -11,7 +11,7 @@ Gauss-Newton step costs one look-up.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from typing import Generic, TypeVar
 
 import cv2
@@ -19,17 +19,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astratag.dictionary import Dictionary
-from astratag.geometry import CELLS, DRAWN_OFFSET, LAYERS, QUIET_MARGIN, TEMPLATE_UNITS, cell_polygons, layer_points, square
+from astratag.geometry import (
+    CELLS,
+    DRAWN_OFFSET,
+    LAYERS,
+    QUIET_MARGIN,
+    TEMPLATE_UNITS,
+    cell_polygons,
+    layer_points,
+    square,
+)
 from astratag.warp import FittedWarp
 
 Array = NDArray[np.float64]
 Light = NDArray[np.float32]
 W = TypeVar("W", bound=FittedWarp)
 
-BLACK, WHITE = CELLS, CELLS + 1
-"""Labels of what is always ink and always paper; cells are labelled by their number."""
-NODES = 64
-"""Points that stand for the Gaussian a pixel sees through."""
+BLACK, WHITE, BEYOND = CELLS, CELLS + 1, CELLS + 2
+"""Labels of what is always ink, always paper, and no longer the print; cells are labelled by their number."""
+LABELS = BEYOND + 1
+KEPT_PICTURES = 64
+OUTSIDE = 0.3
+"""How far beyond the black square there are labels, as a fraction of its side."""
+NODES, MANY_NODES = 24, 64
+"""Points that stand for the Gaussian a pixel sees through: of a picture blurred beforehand, and of a sharp one."""
+SOFTNESS = tuple(4.0 * 2 ** (k / 2) for k in range(10))
+"""Blurs of pictures that are kept, template units, and"""
+SOFT_SHARE = 0.85
+"""how much of the blur where it is least they may be: the rest is summed over nodes."""
+TEXELS = 4.0
+"""Texels to a picture's blur."""
 REACH, LAYER_REACH = 0.07, 0.13
 """How far beyond the black square the print is looked at, as a fraction of its side; and to tell layers apart by."""
 SPACING_PX = 0.8
@@ -42,6 +61,8 @@ STEP_PX = 1.0
 """How far one step may take a point of the print, as a standard deviation."""
 STEPS, SETTLED_PX = 6, 0.02
 FEWEST_POINTS = 60
+LEAST_REST = 0.02
+"""Fraction of the blur's variance that is always left to the nodes."""
 INTERPOLATED = 9 / 4
 """Variance of a pixel's noise over that of values interpolated between pixels."""
 LEAST_NOISE = 0.3
@@ -50,11 +71,11 @@ LEAST_NOISE = 0.3
 
 def _labels() -> NDArray[np.uint8]:
     """Return what is where on the print and its margin, one texel a template unit, as its centre has it."""
-    size = round(TEMPLATE_UNITS * (1 + 2 * QUIET_MARGIN))
-    picture = np.full((size, size), WHITE, np.uint8)
+    size = round(TEMPLATE_UNITS * (1 + 2 * OUTSIDE))
+    picture = np.full((size, size), BEYOND, np.uint8)
 
     def fill(polygon: Array, label: int) -> None:
-        at = polygon + QUIET_MARGIN * TEMPLATE_UNITS
+        at = polygon + OUTSIDE * TEMPLATE_UNITS
         low, high = np.floor(at.min(axis=0)).astype(int), np.ceil(at.max(axis=0)).astype(int)
         x, y = np.meshgrid(*(np.arange(a, b) + 0.5 for a, b in zip(low, high, strict=True)))
         ahead = np.roll(at, -1, axis=0) - at
@@ -62,32 +83,32 @@ def _labels() -> NDArray[np.uint8]:
         inside = np.abs(np.sign(sides).sum(axis=0)) == len(at)
         picture[low[1] : high[1], low[0] : high[0]][inside] = label
 
+    margin = QUIET_MARGIN * TEMPLATE_UNITS
     for layer in LAYERS:
-        if layer.frame is not None:
-            fill(square(*layer.frame), WHITE)
+        fill(square(*(layer.frame or (-margin, TEMPLATE_UNITS + margin))), WHITE)
         fill(square(*layer.black), BLACK)
         for label, cell in enumerate(cell_polygons() + DRAWN_OFFSET):
             fill(layer_points(cell, layer), label)
     return picture
 
 
-LABELS = _labels()
+_LABELS = _labels()
 
 
-def _nodes() -> tuple[Array, Array]:
-    """Return points (K, 2) of a standard normal distribution in the plane, alike in weight, spread evenly.
+def _nodes(count: int) -> Array:
+    """Return points (K, 2) that stand for a standard normal distribution in the plane, alike in weight.
 
-    The weights (K, 4) are of the mean, its derivatives by x and y and by the logarithm of the deviation.
+    Vogel's spiral, with zero mean and unit covariance.
     """
-    i = np.arange(NODES) + 0.5
-    radius, angle = np.sqrt(-2 * np.log(1 - i / NODES)), i * np.pi * (3 - np.sqrt(5.0))  # Vogel's spiral
+    i = np.arange(count) + 0.5
+    radius, angle = np.sqrt(-2 * np.log(1 - i / count)), i * np.pi * (3 - np.sqrt(5.0))
     nodes = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    nodes = np.linalg.solve(np.linalg.cholesky(nodes.T @ nodes / NODES), nodes.T).T
-    weights = np.column_stack([np.ones(NODES), nodes, (nodes**2).sum(axis=1) - 2.0]) / NODES
-    return nodes, weights - np.concatenate([[0.0], weights[:, 1:].mean(axis=0)])
+    nodes -= nodes.mean(axis=0)
+    return np.linalg.solve(np.linalg.cholesky(nodes.T @ nodes / count), nodes.T).T
 
 
-_NODES, _WEIGHTS = _nodes()
+_NODES, _MANY_NODES = _nodes(NODES), _nodes(MANY_NODES)
+_SECOND = (_NODES[:, :, None] * _NODES[:, None, :] - np.eye(2)).reshape(-1, 4)
 
 
 @cache
@@ -111,10 +132,13 @@ class Look:
     to_template: Array
     weight: Array
 
-    def places(self, blur_px: float) -> NDArray[np.float32]:
-        """Return the texels (N, K, 2) of the label picture that the points see through a blur."""
-        spread = (blur_px * _NODES) @ self.to_template.transpose(0, 2, 1)
-        return (self.template[:, None] + spread + (QUIET_MARGIN * TEMPLATE_UNITS - 0.5)).astype(np.float32)
+    def softness(self, blur_px: float) -> float:
+        """Return the softest of ``SOFTNESS`` that a picture may have to be seen through a blur, 0 for a sharp one."""
+        a, b, c, d = self.to_template.reshape(-1, 4).T
+        total, area = a * a + b * b + c * c + d * d, a * d - b * c
+        least = np.sqrt(np.maximum(total - np.sqrt(np.maximum(total**2 - 4 * area**2, 0)), 0) / 2)
+        limit = SOFT_SHARE * blur_px * np.quantile(least, 0.1)
+        return max((softness for softness in SOFTNESS if softness <= limit), default=0.0)
 
     @cached_property
     def root(self) -> Array:
@@ -142,6 +166,58 @@ def look(warp: FittedWarp, shape: tuple[int, ...], reach: float = REACH) -> Look
         return None
     step = TEMPLATE_UNITS * (1 + 2 * reach) / (lines - 1)
     return Look(points[use], at[use], np.linalg.inv(J[use]), np.minimum(step**2 * determinant[use], 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A print's brightness and what is beyond it (H, W, 2), blurred by ``softness`` and sampled every ``texel`` units."""
+
+    channels: Light
+    softness: float
+    texel: float
+
+    def at(self, template: Array) -> Light:
+        """Return the channels (..., 2) at template points (N, K, 2)."""
+        places = ((template + OUTSIDE * TEMPLATE_UNITS) / self.texel - 0.5).astype(np.float32)
+        return cv2.remap(self.channels, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """What N points of a print should look like, black 0 and white 1, by place in the image and by the blur.
+
+    ``mean`` (N,), its derivatives by pixels ``by_place`` (N, 2) and by the logarithm of the blur ``by_blur`` (N,), and
+    how much of what they see is beyond the print, ``beyond`` (N,).
+    """
+
+    mean: Array
+    by_place: Array
+    by_blur: Array
+    beyond: Array
+
+
+def expected(seen: Look, picture: Picture, blur_px: float) -> Expected:
+    """Return what a print should look like through a blur, which is at least its picture's."""
+    spread = blur_px * seen.to_template
+    C = spread @ spread.transpose(0, 2, 1)
+    rest = C - picture.softness**2 * np.eye(2)
+    L = np.zeros_like(C)
+    L[:, 0, 0] = np.sqrt(np.maximum(rest[:, 0, 0], LEAST_REST * C[:, 0, 0]))
+    L[:, 1, 0] = rest[:, 1, 0] / L[:, 0, 0]
+    L[:, 1, 1] = np.sqrt(np.maximum(rest[:, 1, 1] - L[:, 1, 0] ** 2, LEAST_REST * np.linalg.det(C) / C[:, 0, 0]))
+    channels = picture.at(seen.template[:, None] + _NODES @ L.transpose(0, 2, 1))
+    brightness = channels[..., 0].astype(float)
+    first = brightness @ _NODES / NODES
+    second = brightness @ _SECOND / NODES
+    back = np.linalg.inv(L)
+    M = back @ C @ back.transpose(0, 2, 1)
+    by_template = (first[:, None] @ back)[:, 0]
+    return Expected(
+        mean=brightness.mean(axis=1),
+        by_place=(by_template[:, None] @ seen.to_template)[:, 0],
+        by_blur=(M.reshape(-1, 4) * second).sum(axis=1),
+        beyond=channels[..., 1].mean(axis=1),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,11 +251,12 @@ class Synthesis:
         seen = look(warp, light.shape)
         if seen is None:
             return np.zeros((len(self._codes) // 4, 4))
-        places = seen.places(blur_px)
-        labels = cv2.remap(LABELS, places, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
-        rows = np.arange(len(places), dtype=np.int64)[:, None] * (CELLS + 2) + labels
-        share = np.bincount(rows.ravel(), minlength=len(places) * (CELLS + 2)).reshape(-1, CELLS + 2) / NODES
-        nuisance = np.column_stack([seen.plane, share[:, :CELLS].sum(axis=1), share[:, WHITE]])
+        places = seen.template[:, None] + (blur_px * _MANY_NODES) @ seen.to_template.transpose(0, 2, 1)
+        texels = (places + (OUTSIDE * TEMPLATE_UNITS - 0.5)).astype(np.float32)
+        labels = cv2.remap(_LABELS, texels, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+        rows = np.arange(len(labels), dtype=np.int64)[:, None] * LABELS + labels
+        share = np.bincount(rows.ravel(), minlength=len(labels) * LABELS).reshape(-1, LABELS) / MANY_NODES
+        nuisance = np.column_stack([seen.plane, share[:, BLACK:]])  # the shares add up to one
         return _correlations(seen, nuisance, _values(light, seen), share[:, :CELLS] @ self._codes.T).reshape(-1, 4)
 
     def layer_scores(self, light: Light, square_warp: FittedWarp, marker_id: int, blur_px: float) -> Array:
@@ -190,11 +267,13 @@ class Synthesis:
         seen = look(square_warp, light.shape, LAYER_REACH)
         if seen is None:
             return np.zeros(len(LAYERS))
-        picture, value = self._picture(marker_id), _values(light, seen)
-        scores = np.zeros(len(LAYERS))
+        value, scores = _values(light, seen), np.zeros(len(LAYERS))
         for layer in LAYERS:
-            there = replace(seen, template=layer_points(seen.template, layer), to_template=layer.scale * seen.to_template)
-            scores[layer.index] = _contrast(seen, value, _seen_through(picture, there.places(blur_px)).mean(axis=1))[1]
+            there = replace(
+                seen, template=layer_points(seen.template, layer), to_template=layer.scale * seen.to_template
+            )
+            looks = expected(there, self._picture(marker_id, there.softness(blur_px)), blur_px)
+            scores[layer.index] = _contrast(seen, np.column_stack([seen.plane, looks.beyond]), value, looks.mean)[1]
         return scores
 
     def align(self, light: Light, warp: W, marker_id: int, blur_px: float, steps: int = STEPS) -> Alignment[W] | None:
@@ -202,22 +281,22 @@ class Synthesis:
 
         Light and contrast may each vary in a plane over the print.
         """
-        picture = self._picture(marker_id)
         size = len(warp.step_sigma())
         alignment = None
         for _ in range(steps):
             seen = look(warp, light.shape)
             if seen is None:
                 return None
-            mean, by_x, by_y, by_blur = (_seen_through(picture, seen.places(blur_px)) @ _WEIGHTS).T
+            looks = expected(seen, self._picture(marker_id, seen.softness(blur_px)), blur_px)
             value = _values(light, seen)
-            contrast, correlation = _contrast(seen, value, mean)
+            level = np.column_stack([seen.plane, looks.beyond])
+            contrast, correlation = _contrast(seen, level, value, looks.mean)
             if contrast <= 0:
                 return None
             J = warp.jacobian(seen.template)
-            by_warp = -contrast / blur_px * (by_x[:, None] * J[:, 0] + by_y[:, None] * J[:, 1])
-            plane = seen.plane
-            A = np.column_stack([by_warp, contrast * by_blur, plane * mean[:, None], plane]) * seen.root[:, None]
+            by_warp = -contrast * (looks.by_place[:, :1] * J[:, 0] + looks.by_place[:, 1:] * J[:, 1])
+            of_light = (seen.plane * looks.mean[:, None], level)
+            A = np.column_stack([by_warp, contrast * looks.by_blur, *of_light]) * seen.root[:, None]
             reach = np.maximum(np.abs(J).max(axis=(0, 1)), 1e-12)
             step_sigma = np.append(np.minimum(STEP_PX / reach, warp.step_sigma()), BLUR_STEP)
             x, covariance = _least_squares(A, value * seen.root, step_sigma, float(seen.weight.sum()))
@@ -229,14 +308,18 @@ class Synthesis:
                 break
         return alignment
 
-    @cache  # noqa: B019 - one picture an identity, as long as its dictionary
-    def _picture(self, marker_id: int) -> Light:
-        return np.append(self._dictionary.signature(marker_id), (0, 1)).astype(np.float32)[LABELS]
-
-
-def _seen_through(picture: Light, places: NDArray[np.float32]) -> Light:
-    """Return the picture's brightness (N, K) at places (N, K, 2)."""
-    return cv2.remap(picture, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    @lru_cache(maxsize=KEPT_PICTURES)  # noqa: B019 - pictures live as long as their dictionary
+    def _picture(self, marker_id: int, softness: float) -> Picture:
+        """Return the print blurred by ``softness`` template units, 0 for not at all."""
+        brightness = np.append(self._dictionary.signature(marker_id), (0, 1, 0))
+        sharp = np.stack([brightness, np.arange(LABELS) == BEYOND], axis=1).astype(np.float32)[_LABELS]
+        if softness == 0:
+            return Picture(sharp, 0.0, 1.0)
+        size = max(round(len(sharp) * min(TEXELS / softness, 1.0)), 1)
+        texel = len(sharp) / size
+        deviation = np.sqrt(max((softness / texel) ** 2 - 1 / 12 - 1 / 6, 0.1))  # what areas and interpolation leave
+        small = cv2.resize(sharp, (size, size), interpolation=cv2.INTER_AREA)
+        return Picture(cv2.GaussianBlur(small, (0, 0), deviation, borderType=cv2.BORDER_REPLICATE), softness, texel)
 
 
 def _values(light: Light, seen: Look) -> Array:
@@ -257,9 +340,9 @@ def _correlations(seen: Look, nuisance: Array, value: Array, expected: Array) ->
     return columns[:, 0] @ columns[:, 1:] / (length[0] * length[1:])
 
 
-def _contrast(seen: Look, value: Array, expected: Array) -> tuple[float, float]:
+def _contrast(seen: Look, nuisance: Array, value: Array, expected: Array) -> tuple[float, float]:
     """Return how many units of light black and white are apart, and how values correlate with what is expected."""
-    value, expected = _left(seen, seen.plane, np.stack([value, expected], axis=1)).T
+    value, expected = _left(seen, nuisance, np.stack([value, expected], axis=1)).T
     energy, common = max(expected @ expected, 1e-12), value @ expected
     return float(common / energy), float(common / np.sqrt(energy * max(value @ value, 1e-12)))
 
