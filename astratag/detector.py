@@ -34,7 +34,7 @@ from astratag.edges import Transfer, inverse_transfer
 from astratag.fit import measure_layers
 from astratag.geometry import LAYERS, TEMPLATE_UNITS, Layer, layer_points, square
 from astratag.grow import Fit, fit_own_edges, grow, layer_side_px, settle
-from astratag.matching import match
+from astratag.matching import ACCEPT_OF_PIXELS, match
 from astratag.pose import planar_poses, poses_from_square, refine_on_corners
 from astratag.search import (
     BROAD,
@@ -52,7 +52,7 @@ from astratag.search import (
 )
 from astratag.signature import ACCEPT, Artwork, Codebook, Reading, layer_cells
 from astratag.surface import Flat, Surface
-from astratag.synthesis import Synthesis
+from astratag.synthesis import Alignment, Synthesis
 from astratag.tps import KNOTS
 from astratag.transforms import difference
 from astratag.warp import BentWarp, FittedWarp, HomographyWarp, PoseWarp
@@ -92,6 +92,8 @@ GRID = np.stack(np.meshgrid(*[np.linspace(0.0, TEMPLATE_UNITS, GRID_LINES)] * 2)
 """The print's regular grid (9, 9, 2), template units, rows from the top."""
 PIXEL_BLUR = 0.9
 """Blur from which squares are matched, pixels: a good lens's, and what sampling between pixels adds."""
+POLISHED_PX, LEAST_POLISHED = 90.0, 0.95
+"""Markers that look smaller than this are measured by all their pixels, not by their edges, where these look right."""
 SAME_SQUARE = 0.04
 """Squares whose centres and sides differ by less than this fraction are one."""
 MAX_MATCHED = 12
@@ -203,13 +205,32 @@ class Detector:
         seen = match(self._synthesis, view.light, quad, PIXEL_BLUR)
         if seen is None:
             return None
-        square_px = seen.warp(SQUARES[seen.layer])
+        return self._described_by_pixels(view, seen.marker_id, seen.alignment, seen.layer, seen.correlation, "planar")
+
+    def match_near(self, view: View, marker_id: int, warp: FittedWarp, method: str) -> Detection | None:
+        """Return a marker whose print lies where ``warp`` has it to a fraction of a cell, by all its pixels."""
+        aligned = self._synthesis.align(view.light, warp, marker_id, PIXEL_BLUR)
+        if aligned is None or aligned.correlation < LEAST_POLISHED:
+            return None
+        scores = self._synthesis.read(view.light, aligned.warp, aligned.blur_px)
+        row = self.dictionary.row(marker_id)
+        if scores[row, 0] < ACCEPT_OF_PIXELS or scores.argmax() != 4 * row:
+            return None
+        return self._described_by_pixels(view, marker_id, aligned, 0, float(scores[row, 0]), method)
+
+    def _described_by_pixels(
+        self, view: View, marker_id: int, aligned: Alignment, layer: int, correlation: float, method: str
+    ) -> Detection | None:
+        """Return the detection an alignment amounts to: one layer, whose corners stand for all pixels of the print."""
+        square_px = aligned.warp(SQUARES[layer])
         height, width = view.gray.shape
         if (square_px < 0).any() or (square_px > (width - 1, height - 1)).any():
             return None
-        wrong = self._codebook.read_as(layer_cells(view.gray, seen.warp, seen.layer), seen.marker_id).hamming
-        layers = (LayerDetection(seen.layer, square_px, seen.sigma_px(SQUARES[seen.layer])),)
-        return self._described(view, Reading(seen.marker_id, 0, seen.correlation, wrong), seen.warp, layers, "planar")
+        wrong = self._codebook.read_as(layer_cells(view.gray, aligned.warp, layer), marker_id).hamming
+        layers = (LayerDetection(layer, square_px, aligned.sigma_px(SQUARES[layer])),)
+        covariance = aligned.covariance if isinstance(aligned.warp, PoseWarp) else None
+        reading = Reading(marker_id, 0, correlation, wrong)
+        return self._described(view, reading, aligned.warp, layers, method, covariance)
 
     def view(
         self, image: NDArray[np.uint8], camera: Camera | None, boxes: Sequence[NDArray[np.int64]] | None = None
@@ -393,6 +414,10 @@ class Detector:
         reading = self._read_through(view, fit.warp, marker_id)
         if reading is None or reading.correlation < ACCEPT:
             return None
+        if layer_side_px(fit.warp, 0) < POLISHED_PX and not isinstance(fit.warp, BentWarp):
+            polished = self.match_near(view, marker_id, fit.warp, method)
+            if polished is not None:
+                return polished
         layers = measure_layers(fit, view.gray.shape)
         if isinstance(fit.warp, PoseWarp):
             return self._described(view, reading, fit.warp, layers, method, fit.covariance)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astratag.geometry import LAYERS, TEMPLATE_UNITS, square
-from astratag.synthesis import Synthesis
+from astratag.synthesis import Alignment, Synthesis
 from astratag.warp import HomographyWarp
 
 Array = NDArray[np.float64]
@@ -34,8 +34,6 @@ LEAST_LIKENESS = 0.7
 """Correlation of a square with what it reads, borders and all, below which it is something else."""
 MOST_BLUR = 0.1
 """Blur, as a fraction of a square's apparent side, at which its cells can still be told apart."""
-SIGMA_FLOOR_PX = 0.02
-"""What a corner's standard deviation never falls below: print, lens model, shape of the blur."""
 LEAST_SIDE_PX = 7.0
 READINGS = 2
 """How often a square that reads otherwise once aligned may change its mind."""
@@ -43,19 +41,12 @@ OUTER = square(0.0, TEMPLATE_UNITS)
 
 
 class Match(NamedTuple):
-    """A marker found by its pixels: ``layer`` is the square it was found by, ``warp`` takes its whole print there."""
+    """A marker found by its pixels: ``layer`` is the square it was found by, ``alignment`` of its whole print."""
 
     marker_id: int
     layer: int
     correlation: float
-    warp: HomographyWarp
-    covariance: Array
-    blur_px: float
-
-    def sigma_px(self, template: Array) -> float:
-        """Return the standard deviation of each coordinate of points (N, 2) of the print in the image, on average."""
-        J = self.warp.jacobian(template)
-        return float(np.sqrt(np.einsum("nip,pq,niq->ni", J, self.covariance, J).mean() + SIGMA_FLOOR_PX**2))
+    alignment: Alignment[HomographyWarp]
 
 
 def match(synthesis: Synthesis, light: Light, quad: Array, blur_px: float) -> Match | None:
@@ -92,7 +83,7 @@ def match(synthesis: Synthesis, light: Light, quad: Array, blur_px: float) -> Ma
         if again is None:
             return None
         aligned = again
-    return Match(marker_id, layer, correlation, aligned.warp, aligned.covariance, aligned.blur_px)
+    return Match(marker_id, layer, correlation, aligned)
 
 
 def _lead(best: float, next_best: float) -> float:

@@ -52,8 +52,10 @@ TEXELS = 4.0
 REACH, LAYER_REACH = 0.07, 0.13
 """How far beyond the black square the print is looked at, as a fraction of its side; and to tell layers apart by."""
 SPACING_PX = 0.8
-MOST_LINES, FEWEST_LINES = 44, 12
+MOST_LINES, FEWEST_LINES = 32, 12
 """Grid lines across the print: so many that they are ``SPACING_PX`` apart where it looks widest, within bounds."""
+SIGMA_FLOOR_PX = 0.02
+"""What a point's standard deviation never falls below: print, lens model, shape of the blur."""
 LEAST_BLUR_PX, MOST_BLUR_PX = 0.5, 8.0
 BLUR_STEP = 0.3
 """How far one step may take the logarithm of the blur, as a standard deviation."""
@@ -170,7 +172,7 @@ def look(warp: FittedWarp, shape: tuple[int, ...], reach: float = REACH) -> Look
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A print's brightness and what is beyond it (H, W, 2), blurred by ``softness`` and sampled every ``texel`` units."""
+    """A print's brightness and what is beyond it (H, W, 2), blurred by ``softness``, a texel every ``texel`` units."""
 
     channels: Light
     softness: float
@@ -233,6 +235,15 @@ class Alignment(Generic[W]):
     correlation: float
     covariance: Array
     moved_px: float
+
+    def sigma_px(self, template: Array) -> float:
+        """Return what the standard deviation of each coordinate of points (N, 2) of the print amounts to.
+
+        As if all were independent: as many of them as the warp has parameters tell no more than these.
+        """
+        J = self.warp.jacobian(template)
+        variance = np.einsum("nip,pq,niq->", J, self.covariance, J) / len(self.covariance)
+        return float(np.sqrt(variance + SIGMA_FLOOR_PX**2))
 
 
 class Synthesis:
