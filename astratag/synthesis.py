@@ -110,7 +110,9 @@ def _nodes(count: int) -> Array:
 
 
 _NODES, _MANY_NODES = _nodes(NODES), _nodes(MANY_NODES)
-_SECOND = (_NODES[:, :, None] * _NODES[:, None, :] - np.eye(2)).reshape(-1, 4)
+_X, _Y = _NODES.T
+_MOMENTS = (np.stack([_X**0, _X, _Y, _X * _X - 1, _X * _Y, _Y * _Y - 1]) / NODES).astype(np.float32)
+"""Take brightnesses at the nodes to their mean, and by parts to its first and second derivatives (6, K)."""
 
 
 @cache
@@ -167,7 +169,9 @@ def look(warp: FittedWarp, shape: tuple[int, ...], reach: float = REACH) -> Look
     if use.sum() < FEWEST_POINTS:
         return None
     step = TEMPLATE_UNITS * (1 + 2 * reach) / (lines - 1)
-    return Look(points[use], at[use], np.linalg.inv(J[use]), np.minimum(step**2 * determinant[use], 1.0))
+    (a, b), (c, d) = J[use].transpose(1, 2, 0)
+    inverse = np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2) / determinant[use, None, None]
+    return Look(points[use], at[use], inverse, np.minimum(step**2 * determinant[use], 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,10 +182,13 @@ class Picture:
     softness: float
     texel: float
 
-    def at(self, template: Array) -> Light:
-        """Return the channels (..., 2) at template points (N, K, 2)."""
-        places = ((template + OUTSIDE * TEMPLATE_UNITS) / self.texel - 0.5).astype(np.float32)
-        return cv2.remap(self.channels, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    def at(self, template: Array, lxx: Array, lyx: Array, lyy: Array) -> Light:
+        """Return the channels (N, K, 2) at nodes around template points (N, 2), spread by Cholesky factors (N,)."""
+        x, y = _NODES.T.astype(np.float32)
+        middle = ((template + OUTSIDE * TEMPLATE_UNITS) / self.texel - 0.5).astype(np.float32)
+        lxx, lyx, lyy = ((part / self.texel).astype(np.float32)[:, None] for part in (lxx, lyx, lyy))
+        columns, rows = middle[:, :1] + lxx * x, middle[:, 1:] + lyx * x + lyy * y
+        return cv2.remap(self.channels, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,25 +207,23 @@ class Expected:
 
 def expected(seen: Look, picture: Picture, blur_px: float) -> Expected:
     """Return what a print should look like through a blur, which is at least its picture's."""
-    spread = blur_px * seen.to_template
-    C = spread @ spread.transpose(0, 2, 1)
-    rest = C - picture.softness**2 * np.eye(2)
-    L = np.zeros_like(C)
-    L[:, 0, 0] = np.sqrt(np.maximum(rest[:, 0, 0], LEAST_REST * C[:, 0, 0]))
-    L[:, 1, 0] = rest[:, 1, 0] / L[:, 0, 0]
-    L[:, 1, 1] = np.sqrt(np.maximum(rest[:, 1, 1] - L[:, 1, 0] ** 2, LEAST_REST * np.linalg.det(C) / C[:, 0, 0]))
-    channels = picture.at(seen.template[:, None] + _NODES @ L.transpose(0, 2, 1))
-    brightness = channels[..., 0].astype(float)
-    first = brightness @ _NODES / NODES
-    second = brightness @ _SECOND / NODES
-    back = np.linalg.inv(L)
-    M = back @ C @ back.transpose(0, 2, 1)
-    by_template = (first[:, None] @ back)[:, 0]
+    ax, ay, bx, by = blur_px * seen.to_template.reshape(-1, 4).T
+    cxx, cxy, cyy = ax * ax + ay * ay, ax * bx + ay * by, bx * bx + by * by  # the blur's covariance on the print
+    soft = picture.softness**2
+    lxx = np.sqrt(np.maximum(cxx - soft, LEAST_REST * cxx))  # Cholesky factor of what the picture leaves of it
+    lyx = cxy / lxx
+    lyy = np.sqrt(np.maximum(cyy - soft - lyx**2, LEAST_REST * (ax * by - ay * bx) ** 2 / cxx))
+    channels = picture.at(seen.template, lxx, lyx, lyy)
+    mean, x, y, xx, xy, yy = _MOMENTS @ np.ascontiguousarray(channels[..., 0]).T
+    x, y = x / lxx - y * lyx / (lxx * lyy), y / lyy  # derivatives on the print
+    dxx, dyx, dyy = 1 / lxx, -lyx / (lxx * lyy), 1 / lyy
+    mxx, mxy = dxx * dxx * cxx, dxx * (dyx * cxx + dyy * cxy)
+    myy = dyx * dyx * cxx + 2 * dyx * dyy * cxy + dyy * dyy * cyy
     return Expected(
-        mean=brightness.mean(axis=1),
-        by_place=(by_template[:, None] @ seen.to_template)[:, 0],
-        by_blur=(M.reshape(-1, 4) * second).sum(axis=1),
-        beyond=channels[..., 1].mean(axis=1),
+        mean=mean.astype(float),
+        by_place=(x[:, None] * seen.to_template[:, 0] + y[:, None] * seen.to_template[:, 1]),
+        by_blur=mxx * xx + 2 * mxy * xy + myy * yy,
+        beyond=channels[..., 1].mean(axis=1).astype(float),
     )
 
 
@@ -319,18 +324,26 @@ class Synthesis:
                 break
         return alignment
 
-    @lru_cache(maxsize=KEPT_PICTURES)  # noqa: B019 - pictures live as long as their dictionary
     def _picture(self, marker_id: int, softness: float) -> Picture:
-        """Return the print blurred by ``softness`` template units, 0 for not at all."""
-        brightness = np.append(self._dictionary.signature(marker_id), (0, 1, 0))
-        sharp = np.stack([brightness, np.arange(LABELS) == BEYOND], axis=1).astype(np.float32)[_LABELS]
-        if softness == 0:
-            return Picture(sharp, 0.0, 1.0)
-        size = max(round(len(sharp) * min(TEXELS / softness, 1.0)), 1)
-        texel = len(sharp) / size
-        deviation = np.sqrt(max((softness / texel) ** 2 - 1 / 12 - 1 / 6, 0.1))  # what areas and interpolation leave
-        small = cv2.resize(sharp, (size, size), interpolation=cv2.INTER_AREA)
-        return Picture(cv2.GaussianBlur(small, (0, 0), deviation, borderType=cv2.BORDER_REPLICATE), softness, texel)
+        return _picture(self._dictionary.signature(marker_id).tobytes(), softness)
+
+
+@lru_cache(maxsize=KEPT_PICTURES)
+def _picture(signature: bytes, softness: float) -> Picture:
+    """Return the print of a signature (48 bytes) blurred by ``softness`` template units, 0 for not at all."""
+    levels = np.zeros((2, 256), np.uint8)
+    levels[0, :LABELS] = 255 * np.append(np.frombuffer(signature, np.uint8), (0, 1, 0))
+    levels[1, BEYOND] = 255
+    size = max(round(len(_LABELS) * min(TEXELS / softness, 1.0)), 1) if softness else len(_LABELS)
+    texel = len(_LABELS) / size
+    deviation = np.sqrt(max((softness / texel) ** 2 - 1 / 12 - 1 / 6, 0.1))  # what areas and interpolation leave
+    channels = []
+    for level in levels:
+        small = cv2.resize(cv2.LUT(_LABELS, level), (size, size), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+        channels.append(
+            cv2.GaussianBlur(small, (0, 0), deviation, borderType=cv2.BORDER_REPLICATE) if softness else small
+        )
+    return Picture(cv2.merge(channels), softness, texel)
 
 
 def _values(light: Light, seen: Look) -> Array:
