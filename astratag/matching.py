@@ -79,10 +79,9 @@ def match(synthesis: Synthesis, light: Light, quad: Array, blur_px: float) -> Ma
         return None
     if layer > 0:
         whole = HomographyWarp.from_points(square(*LAYERS[layer].black), warp(OUTER))
-        again = synthesis.align(light, whole, marker_id, blur_px)
-        if again is None:
-            return None
-        aligned = again
+        aligned = synthesis.align(light, whole, marker_id, blur_px)
+    if aligned is None:
+        return None
     return Match(marker_id, layer, correlation, aligned)
 
 

@@ -357,18 +357,18 @@ def _left(seen: Look, nuisance: Array, columns: Array) -> Array:
     return columns - Q @ (Q.T @ columns)
 
 
-def _correlations(seen: Look, nuisance: Array, value: Array, expected: Array) -> Array:
-    """Return the correlations (K,) of values (N,) with what is expected (N, K), a nuisance (N, M) taken out."""
-    columns = _left(seen, nuisance, np.column_stack([value, expected]))
+def _correlations(seen: Look, nuisance: Array, value: Array, looks: Array) -> Array:
+    """Return the correlations (K,) of values (N,) with how they should look (N, K), a nuisance (N, M) taken out."""
+    columns = _left(seen, nuisance, np.column_stack([value, looks]))
     length = np.maximum(np.sqrt(np.einsum("nk,nk->k", columns, columns)), 1e-9)
     return columns[:, 0] @ columns[:, 1:] / (length[0] * length[1:])
 
 
-def _contrast(seen: Look, nuisance: Array, value: Array, expected: Array) -> tuple[float, float]:
+def _contrast(seen: Look, nuisance: Array, value: Array, looks: Array) -> tuple[float, float]:
     """Return how many units of light black and white are apart, and how values correlate with what is expected."""
-    value, expected = _left(seen, nuisance, np.stack([value, expected], axis=1)).T
-    energy, common = max(expected @ expected, 1e-12), value @ expected
-    return float(common / energy), float(common / np.sqrt(energy * max(value @ value, 1e-12)))
+    left, right = _left(seen, nuisance, np.stack([value, looks], axis=1)).T
+    energy, common = float(right @ right) + 1e-12, float(left @ right)
+    return common / energy, common / float(np.sqrt(energy * (left @ left + 1e-12)))
 
 
 def _least_squares(A: Array, value: Array, step_sigma: Array, pixels: float) -> tuple[Array, Array]:

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from astratag.camera import Camera
 from astratag.candidates import OUTER
 from astratag.detection import Detection
-from astratag.detector import HALVE_FROM_PX, Detector, View, surest
+from astratag.detector import HALVE_FROM_PX, POLISHED_PX, Detector, View, surest
 from astratag.fit import fit_edges
-from astratag.grow import ALL_EDGES, SETTLED_PX, Fit, grow, settle
+from astratag.grow import ALL_EDGES, SETTLED_PX, Fit, grow, layer_side_px, settle
 from astratag.search import COARSE, PLAIN, find_outlines
 from astratag.surface import Flat
 from astratag.transforms import difference, perturb
-from astratag.warp import FittedWarp, HomographyWarp, PoseWarp
+from astratag.warp import HomographyWarp, PoseWarp
 
 Array = NDArray[np.float64]
 
@@ -118,16 +118,31 @@ class Tracker:
                 detection = self.detector.describe(view, track.marker_id, fit, "tracked")
                 if detection is not None:
                     return detection
+        return self._match_near(view, track)
+
+    def _match_near(self, view: View, track: Track) -> Detection | None:
+        """Return a tracked marker that is too small or blurred for its edges to be followed."""
+        for T_cam_marker in track.predictions:
+            warp = self._predicted(view, track.marker_id, T_cam_marker)
+            if layer_side_px(warp, 0) < POLISHED_PX:
+                detection = self.detector.match_near(view, track.marker_id, warp, "tracked")
+                if detection is not None:
+                    return detection
         return None
+
+    def _predicted(self, view: View, marker_id: int, T_cam_marker: Array) -> HomographyWarp | PoseWarp:
+        """Return where a print is under a predicted pose: as a plane's when its surface is not known."""
+        spec = self.detector.spec(marker_id)
+        assert view.camera is not None
+        warp = PoseWarp(view.camera, spec.side_m, spec.surface or Flat(), T_cam_marker)
+        return warp if spec.surface is not None else HomographyWarp.from_points(OUTER, warp(OUTER))
 
     def _fit_near(self, view: View, marker_id: int, T_cam_marker: Array, search_px: float) -> Fit | None:
         """Return the fit to all edges around a predicted pose."""
-        spec = self.detector.spec(marker_id)
-        assert view.camera is not None
-        warp: FittedWarp = PoseWarp(view.camera, spec.side_m, spec.surface or Flat(), T_cam_marker)
-        if spec.surface is None:
-            return grow(view.light, HomographyWarp.from_points(OUTER, warp(OUTER)), 0)
-        fit = fit_edges(view.light, warp, ALL_EDGES, search_px, sharp_only=True)
+        warp = self._predicted(view, marker_id, T_cam_marker)
+        if isinstance(warp, HomographyWarp):
+            return grow(view.light, warp, 0)
+        fit: Fit | None = fit_edges(view.light, warp, ALL_EDGES, search_px, sharp_only=True)
         return fit if fit is None or fit.moved_px < SETTLED_PX else settle(view.light, fit.warp)
 
     def _search_near(self, view: View, track: Track, around: Array) -> Detection | None:
