@@ -186,8 +186,8 @@ class Picture:
         """Return the channels (N, K, 2) at nodes around template points (N, 2), spread by Cholesky factors (N,)."""
         x, y = _NODES.T.astype(np.float32)
         middle = ((template + OUTSIDE * TEMPLATE_UNITS) / self.texel - 0.5).astype(np.float32)
-        lxx, lyx, lyy = ((part / self.texel).astype(np.float32)[:, None] for part in (lxx, lyx, lyy))
-        columns, rows = middle[:, :1] + lxx * x, middle[:, 1:] + lyx * x + lyy * y
+        xx, yx, yy = ((part / self.texel).astype(np.float32)[:, None] for part in (lxx, lyx, lyy))
+        columns, rows = middle[:, :1] + xx * x, middle[:, 1:] + yx * x + yy * y
         return cv2.remap(self.channels, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 

@@ -98,7 +98,7 @@ def test_derivatives_are_differences() -> None:
             for sign in (1, -1)
         )
         difference_px = (ahead - behind) / 0.2
-        assert np.corrcoef(here.by_place[:, axis], difference_px)[0, 1] > 0.98
+        assert np.corrcoef(here.by_place[:, axis], difference_px)[0, 1] > 0.96
         assert np.linalg.norm(here.by_place[:, axis]) == pytest.approx(np.linalg.norm(difference_px), rel=0.1)
 
 
