@@ -324,7 +324,7 @@ class Detector:
             return None
         layers = (LayerDetection(layer, square_px, aligned.sigma_px(SQUARES[layer])),)
         is_pose = isinstance(aligned.warp, PoseWarp | CylinderWarp)
-        covariance = aligned.covariance[:6, :6] if is_pose else None
+        covariance = aligned.cautious_covariance[:6, :6] if is_pose else None
         reading = Reading(marker_id, 0, correlation, wrong, cells=INDEPENDENT_CELLS)
         return self._described(view, reading, aligned.warp, layers, method, covariance)
 
