@@ -1,6 +1,6 @@
 """Listen to `relnav node relay --to udp://HOST:PORT` or `udp+json://HOST:PORT`, with the standard library alone.
 
-    python examples/udp_listen.py 5600
+For example: python examples/udp_listen.py 5600
 """
 
 import json

@@ -45,9 +45,11 @@ class Address:
     @classmethod
     def resolve(cls, host: str, port: int) -> Address:
         """Look up a host.  Raises ValueError when it is unknown, or the port is none."""
+        if not 0 < port < 65536:
+            raise ValueError(f"cannot find {host}:{port}: ports are 1 to 65535")
         try:
-            family, _, _, _, sockaddr = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        except (OSError, OverflowError) as error:
+            family, _, _, _, sockaddr = socket.getaddrinfo(host.strip("[]"), port, type=socket.SOCK_STREAM)[0]
+        except (OSError, UnicodeError) as error:
             raise ValueError(f"cannot find {host}:{port}: {error}") from error
         return cls(family, sockaddr)
 
