@@ -1,9 +1,9 @@
 """Follow the filtered relative state with nothing but Zenoh and the generated protobuf: the pattern for C++ or MATLAB.
 
     pip install eclipse-zenoh protobuf grpcio-tools
-    python -m grpc_tools.protoc -I schemas/proto --python_out=. relnav.proto
+    python -m grpc_tools.protoc -I schemas/proto --python_out=examples relnav.proto
     relnav live --source /dev/video0 ...            # in another terminal
-    python zenoh_state.py
+    python examples/zenoh_state.py
 
 For C++: ``protoc --cpp_out``, zenoh-cpp, and the same key.  Each sample on ``relnav/<vehicle>/state`` is one
 ``relnav.RelativeState``; beside it travels an attachment of three little-endian int64: the frame's sequence number,
@@ -41,6 +41,7 @@ def main(endpoint: str = "tcp/127.0.0.1:7447") -> None:
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", f'["{endpoint}"]')
+    config.insert_json5("connect/timeout_ms", "20000")  # the run may only be starting
     with zenoh.open(config) as session:
         subscriber = session.declare_subscriber(KEY)
         for sample in subscriber:

@@ -65,13 +65,14 @@ def _run_source(args: argparse.Namespace, link: Link, stop: StopSignal) -> None:
 
 
 def _run_relay(args: argparse.Namespace, process: Process, link: Link, options: NodeOptions, stop: StopSignal) -> None:
-    from nodes.relay import RelayWork, open_outlet
+    from nodes.relay import RelayWork, open_outlet, parse_destination
 
     if not args.to:
         raise ValueError("the relay node needs --to: where states go, such as udp://127.0.0.1:5600 or ros2")
+    destinations = [parse_destination(text) for text in args.to]
     vehicle = options.mission.vehicle
     with Bus(link, vehicle=vehicle, node=process.name, lossless=False) as bus:
-        outlets = [(destination, open_outlet(destination, vehicle, bus)) for destination in args.to]
+        outlets = [(to.text, open_outlet(to, vehicle, bus)) for to in destinations]
         Shell(process, RelayWork(outlets, _warn), options, bus, stop).run()
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
 from nodes.bus import Bus, Link, Received
 from nodes.outlets import Address, FortyTwoOutlet, Outlet, Ros2Outlet, UdpOutlet
@@ -25,21 +26,40 @@ FORMS = (
 _DESTINATION = re.compile(r"([a-z0-9+]+)(?:://(\[[^]]+\]|[^:/]+):(\d{1,5})(?:/(\d{1,3}))?)?")
 
 
-def open_outlet(destination: str, vehicle: str, bus: Bus) -> Outlet:
-    """Return the outlet for what follows ``--to``.
+@dataclass(frozen=True)
+class Destination:
+    """Where states go."""
 
-    Raises ValueError when it has none of the forms, its host is unknown, or it needs an extra that is missing.
-    """
-    match = _DESTINATION.fullmatch(destination)
-    kind, host, port, spacecraft = match.groups() if match else ("", None, None, None)
-    if kind in ROS_KINDS and spacecraft is None:
-        own = None if host is None else _session(f"tcp/{host}:{port}", vehicle)
-        return Ros2Outlet(Ros2Encoder(vehicle), own or bus, bridged=kind == "ros2dds", owned=own)
-    if kind in DATAGRAMS and host and spacecraft is None:
-        return UdpOutlet(Address.resolve(host, int(port or 0)), DATAGRAMS[kind])
-    if kind in DIALECTS and host:
-        return FortyTwoOutlet(Address.resolve(host, int(port or 0)), int(spacecraft or 0), DIALECTS[kind])
-    raise ValueError(f"cannot send states to {destination!r}: the forms are {FORMS}")
+    text: str
+    """As the user wrote it."""
+    kind: str
+    host: str
+    """Empty: ROS 2 on the relay's own session."""
+    port: int
+    spacecraft: int
+
+
+def parse_destination(text: str) -> Destination:
+    """Read what follows ``--to``.  Raises ValueError that shows the forms."""
+    match = _DESTINATION.fullmatch(text)
+    kind, host, port, spacecraft = match.groups(default="") if match else ("", "", "", "")
+    ros, forty_two = kind in ROS_KINDS, kind in DIALECTS
+    if not (ros or forty_two or kind in DATAGRAMS) or not (host or ros) or (spacecraft and not forty_two):
+        raise ValueError(f"cannot send states to {text!r}: the forms are {FORMS}")
+    return Destination(text, kind, host, int(port or 0), int(spacecraft or 0))
+
+
+def open_outlet(destination: Destination, vehicle: str, bus: Bus) -> Outlet:
+    """Return the outlet for a destination.  Raises ValueError when its host is unknown, or an extra is missing."""
+    kind, host, port = destination.kind, destination.host, destination.port
+    if kind in ROS_KINDS:
+        encoder = Ros2Encoder(vehicle)
+        own = _session(f"tcp/{host}:{port}", vehicle) if host else None
+        return Ros2Outlet(encoder, own or bus, bridged=kind == "ros2dds", owned=own)
+    address = Address.resolve(host, port)
+    if kind in DATAGRAMS:
+        return UdpOutlet(address, DATAGRAMS[kind])
+    return FortyTwoOutlet(address, destination.spacecraft, DIALECTS[kind])
 
 
 def _session(endpoint: str, vehicle: str) -> Bus:

@@ -12,7 +12,7 @@ import zenoh
 
 from nodes.bus import Bus, Link, Presence, Received, free_endpoint
 from nodes.outlets import Address, FortyTwoOutlet, Outlet
-from nodes.relay import RelayWork, open_outlet
+from nodes.relay import Destination, RelayWork, open_outlet, parse_destination
 from pipeline.adapters import fortytwo, udp
 from pipeline.adapters.ros2 import Ros2Encoder
 from schemas import Envelope, Mode, RelativeState, Stamp
@@ -47,6 +47,10 @@ def bus() -> Iterator[Bus]:
         yield hub
 
 
+def opened(text: str, bus: Bus) -> Outlet:
+    return open_outlet(parse_destination(text), "chaser", bus)
+
+
 def relay_to(*outlets: tuple[str, Outlet]) -> tuple[RelayWork, list[str]]:
     warnings: list[str] = []
     return RelayWork(outlets, warnings.append), warnings
@@ -55,7 +59,7 @@ def relay_to(*outlets: tuple[str, Outlet]) -> tuple[RelayWork, list[str]]:
 @pytest.mark.parametrize("kind", ["udp", "udp+json"])
 def test_every_state_is_a_datagram(listening, bus, kind):
     decode = load_example("udp_listen").decode
-    work, warnings = relay_to((kind, open_outlet(f"{kind}://127.0.0.1:{listening.getsockname()[1]}", "chaser", bus)))
+    work, warnings = relay_to((kind, opened(f"{kind}://127.0.0.1:{listening.getsockname()[1]}", bus)))
     for k, mode in enumerate(Mode):
         work.handle(received(some_state(mode), k))
     got = [decode(listening.recv(65535)) for _ in Mode]
@@ -113,7 +117,7 @@ def test_an_absent_42_is_told_once_and_costs_the_others_nothing(listening, bus, 
     server.close()
     here = f"udp://127.0.0.1:{listening.getsockname()[1]}"
     there = f"42://127.0.0.1:{address[1]}"
-    work, warnings = relay_to(*((name, open_outlet(name, "chaser", bus)) for name in (there, here)))
+    work, warnings = relay_to(*((name, opened(name, bus)) for name in (there, here)))
     for k in range(20):
         work.handle(received(some_state(), k))
         time.sleep(0.005)
@@ -134,7 +138,7 @@ def test_an_absent_42_is_told_once_and_costs_the_others_nothing(listening, bus, 
 def test_ros_hears_tracked_states_on_its_own_keys(bus, monkeypatch, kind):
     pytest.importorskip("rosbags", reason="the extra `ros2` is not installed")
     monkeypatch.setenv("ROS_DOMAIN_ID", "3")
-    outlet = open_outlet(kind, "chaser", bus)
+    outlet = opened(kind, bus)
     samples: list[zenoh.Sample] = []
     subscriber = bus._session.declare_subscriber("3/**" if kind == "ros2" else "**", samples.append)
     work, _ = relay_to((kind, outlet))
@@ -145,7 +149,8 @@ def test_ros_hears_tracked_states_on_its_own_keys(bus, monkeypatch, kind):
         time.sleep(0.01)
     time.sleep(0.1)
     expected = {
-        topic.key(3) if kind == "ros2" else topic.name: cdr for topic, cdr in outlet._encoder.messages(some_state())
+        topic.key(3) if kind == "ros2" else topic.name: cdr
+        for topic, cdr in Ros2Encoder("chaser").messages(some_state())
     }
     assert {str(sample.key_expr): sample.payload.to_bytes() for sample in samples} == expected
     assert len(samples) == 2, "one of each, for the state in TRACK alone"
@@ -167,13 +172,13 @@ def test_a_ros_domain_that_is_no_number_is_refused(bus, monkeypatch):
     pytest.importorskip("rosbags", reason="the extra `ros2` is not installed")
     monkeypatch.setenv("ROS_DOMAIN_ID", "mars")
     with pytest.raises(ValueError, match="ROS_DOMAIN_ID must be a number, got 'mars'"):
-        open_outlet("ros2", "chaser", bus)
+        opened("ros2", bus)
 
 
 def test_without_rosbags_the_repair_is_named(bus, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
     with pytest.raises(ValueError, match="uv sync --extra ros2"):
-        open_outlet("ros2", "chaser", bus)
+        opened("ros2", bus)
 
 
 @pytest.mark.parametrize(
@@ -192,15 +197,22 @@ def test_without_rosbags_the_repair_is_named(bus, monkeypatch):
         "udp://h:99999999",
     ],
 )
-def test_a_destination_of_no_known_form_is_refused(bus, text):
+def test_a_destination_of_no_known_form_is_refused(text):
     with pytest.raises(ValueError, match="the forms are udp://HOST:PORT"):
-        open_outlet(text, "chaser", bus)
+        parse_destination(text)
+
+
+def test_a_destination_is_read():
+    assert parse_destination("42+brackets://[::1]:10001/2") == Destination(
+        "42+brackets://[::1]:10001/2", "42+brackets", "[::1]", 10001, 2
+    )
+    assert parse_destination("ros2").host == ""
 
 
 @pytest.mark.parametrize("text", ["udp://no.such.host.invalid:5", "42://127.0.0.1:99999"])
 def test_a_host_or_port_that_is_none_is_refused(bus, text):
     with pytest.raises(ValueError, match="cannot find"):
-        open_outlet(text, "chaser", bus)
+        opened(text, bus)
 
 
 @pytest.mark.slow
