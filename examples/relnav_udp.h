@@ -18,7 +18,7 @@ typedef struct {
     uint16_t version;              /* RELNAV_VERSION */
     uint8_t mode;
     uint8_t flags;
-    uint64_t sequence;             /* of the frame */
+    int64_t sequence;              /* of the frame */
     int64_t t_capture_ns;          /* UTC, mid-exposure */
     double age_s;                  /* since the last accepted measurement; NaN when there was none */
     double hypothesis_probability;

@@ -17,11 +17,11 @@ static int show(const relnav_state *state, long bytes)
         return 1;
     }
     if (!(state->flags & RELNAV_VALID)) {
-        printf("%llu mode %d: hold\n", (unsigned long long)state->sequence, state->mode);
+        printf("%lld mode %d: hold\n", (long long)state->sequence, state->mode);
         return 0;
     }
-    printf("%llu mode %d: %.17g %.17g %.17g m, variance along x %.17g m2, age %.3f s\n",
-           (unsigned long long)state->sequence, state->mode, state->position_m[0], state->position_m[1],
+    printf("%lld mode %d: %.17g %.17g %.17g m, variance along x %.17g m2, age %.3f s\n",
+           (long long)state->sequence, state->mode, state->position_m[0], state->position_m[1],
            state->position_m[2], state->covariance_upper[0], state->age_s);
     return 0;
 }

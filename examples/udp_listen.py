@@ -9,7 +9,7 @@ import struct
 import sys
 import zlib
 
-PACKET = struct.Struct("<4sHBBQqdd3d4d3d3d78dII")
+PACKET = struct.Struct("<4sHBBqqdd3d4d3d3d78dII")
 MODES = ("INIT", "AMBIGUOUS", "TRACK", "COAST", "LOST")
 VALID, NUMBERS = 1, 2
 

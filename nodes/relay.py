@@ -80,10 +80,10 @@ class RelayWork:
         for name, outlet in self._outlets:
             try:
                 sent = outlet.send(state, received.envelope.stamp)
-            except OSError as error:
+            except (OSError, ValueError) as error:
                 if name not in self._failing:
                     self._failing.add(name)
-                    self._warn(f"{name}: {error.strerror or error}; it is tried again")
+                    self._warn(f"{name}: {getattr(error, 'strerror', None) or error}; it is tried again")
                 continue
             if sent and name in self._failing:
                 self._failing.discard(name)

@@ -134,6 +134,19 @@ def test_an_absent_42_is_told_once_and_costs_the_others_nothing(listening, bus, 
     work.close()
 
 
+def test_a_state_that_one_consumer_cannot_hold_reaches_the_others(listening, bus):
+    """A clock beyond 2038, which ROS cannot stamp."""
+    pytest.importorskip("rosbags", reason="the extra `ros2` is not installed")
+    here = f"udp://127.0.0.1:{listening.getsockname()[1]}"
+    work, warnings = relay_to(*((name, opened(name, bus)) for name in ("ros2", here)))
+    state = some_state(t_ns=2**62)
+    for k in range(2):
+        work.handle(received(state, k))
+    assert [listening.recv(2000) for _ in range(2)] == [udp.packet(state, k) for k in range(2)]
+    (warning,) = warnings
+    assert warning.startswith("ros2: t_capture_ns") and "2038" in warning
+
+
 @pytest.mark.parametrize("kind", ["ros2", "ros2dds"])
 def test_ros_hears_tracked_states_on_its_own_keys(bus, monkeypatch, kind):
     pytest.importorskip("rosbags", reason="the extra `ros2` is not installed")

@@ -91,6 +91,12 @@ def test_the_quaternion_comes_last_component_last(encoder, store):
     assert struct.unpack("<d", tf_cdr[-8:]) == (state.T_chaser_target.rotation_wxyz.w,)
 
 
+@pytest.mark.parametrize("t_ns", [-1, 2**31 * 10**9])
+def test_a_time_that_ros_cannot_stamp_is_refused(encoder, t_ns):
+    with pytest.raises(ValueError, match="outside what a ROS stamp holds"):
+        encoder.messages(some_state(t_ns=t_ns))
+
+
 @pytest.mark.parametrize("mode", NOT_TRUSTED, ids=lambda mode: mode.name)
 def test_nothing_is_sent_of_any_other_state(encoder, mode):
     assert encoder.messages(some_state(mode)) == []

@@ -70,7 +70,7 @@ def test_a_damaged_datagram_is_refused(decode):
 
 
 def test_a_packet_fits_into_one_ethernet_frame():
-    assert len(packet(some_state(), 2**64 - 1)) == PACKET_BYTES == 776 < 1472
+    assert len(packet(some_state(), 2**63 - 1)) == PACKET_BYTES == 776 < 1472
 
 
 def test_json_is_one_line_with_the_port():

@@ -86,10 +86,15 @@ class Ros2Encoder:
         self.tf_topic = self._topic("tf", TF_TYPE)
 
     def messages(self, state: RelativeState) -> list[tuple[RosTopic, bytes]]:
-        """Return the CDR of each topic's message; nothing for a state that is not trusted."""
+        """Return the CDR of each topic's message; nothing for a state that is not trusted.
+
+        Raises ValueError for a time that ROS cannot stamp.
+        """
         estimate = trusted_estimate(state)
         if estimate is None:
             return []
+        if not 0 <= state.t_capture_ns // NS_PER_S < 2**31:
+            raise ValueError(f"t_capture_ns {state.t_capture_ns} is outside what a ROS stamp holds, 1970 to 2038")
         return [
             (self.pose_topic, self._cdr(POSE_TYPE, self._pose(state, estimate))),
             (self.tf_topic, self._cdr(TF_TYPE, self._transforms(state, estimate))),

@@ -8,7 +8,7 @@ The struct (``examples/relnav_udp.h`` is the same in C) is little-endian, packed
 | 4 | u16 | version of this layout, 1 |
 | 6 | u8 | mode: 0 INIT, 1 AMBIGUOUS, 2 TRACK, 3 COAST, 4 LOST |
 | 7 | u8 | flags: 1 VALID, may be flown on; 2 NUMBERS, what follows the age is not NaN |
-| 8 | u64 | sequence number of the frame |
+| 8 | i64 | sequence number of the frame |
 | 16 | i64 | time of validity, UTC nanoseconds |
 | 24 | f64 | age: seconds since the last accepted measurement, NaN when there was none |
 | 32 | f64 | probability of the hypothesis |
@@ -41,7 +41,7 @@ MAGIC = b"RNAV"
 VERSION = 1
 VALID, NUMBERS = 1, 2
 UPPER = np.triu_indices(12)
-_BODY = struct.Struct("<4sHBBQq93d")
+_BODY = struct.Struct("<4sHBBqq93d")
 _TAIL = struct.Struct("<II")
 PACKET_BYTES = _BODY.size + _TAIL.size
 _NO_NUMBERS = (math.nan,) * (3 + 4 + 3 + 3 + len(UPPER[0]))
