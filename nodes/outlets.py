@@ -26,7 +26,8 @@ class Outlet(Protocol):
     def send(self, state: RelativeState, stamp: Stamp) -> bool:
         """Hand on one state; False when the consumer is not ready for it, or is not told of it.
 
-        Raises OSError when it cannot be reached; the next state tries again.
+        Raises OSError when it cannot be reached, ValueError when its format cannot hold the state; the next state is
+        tried all the same.
         """
         ...
 

@@ -83,7 +83,7 @@ class RelayWork:
             except (OSError, ValueError) as error:
                 if name not in self._failing:
                     self._failing.add(name)
-                    self._warn(f"{name}: {getattr(error, 'strerror', None) or error}; it is tried again")
+                    self._warn(f"{name}: {_reason(error)}; it is tried again")
                 continue
             if sent and name in self._failing:
                 self._failing.discard(name)
@@ -102,3 +102,7 @@ class RelayWork:
         """Close all outlets."""
         for _, outlet in self._outlets:
             outlet.close()
+
+
+def _reason(error: Exception) -> str:
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)

@@ -143,6 +143,7 @@ def test_a_state_that_one_consumer_cannot_hold_reaches_the_others(listening, bus
     for k in range(2):
         work.handle(received(state, k))
     assert [listening.recv(2000) for _ in range(2)] == [udp.packet(state, k) for k in range(2)]
+    work.close()
     (warning,) = warnings
     assert warning.startswith("ros2: t_capture_ns") and "2038" in warning
 
