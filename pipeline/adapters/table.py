@@ -8,7 +8,7 @@ chaser's axes; velocity along the chaser's; rate along the target's.  What a sta
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.adapters.estimate import POSITION, RATE, ROTATION, VELOCITY, estimate_of, trusted_estimate
-from schemas import PortToPort, RelativeState
+from schemas import PortToPort, Quaternion, RelativeState, Vector3
 
 Row = dict[str, Any]
 
@@ -37,20 +37,24 @@ class Recorded:
     t_receipt_ns: int
 
 
-def _named(pattern: str, values: Iterable[float] | None, axes: str = "xyz") -> Row:
-    """Return a cell for each component, None throughout when there are no values."""
-    cells = [None] * len(axes) if values is None else [float(value) for value in values]
-    return {pattern.format(axis): cell for axis, cell in zip(axes, cells, strict=True)}
+def _components(pattern: str, vector: Vector3 | Quaternion | None, axes: str = "xyz") -> Row:
+    return {pattern.format(axis): None if vector is None else getattr(vector, axis) for axis in axes}
+
+
+def _sigmas(state: RelativeState) -> Row:
+    estimate = estimate_of(state)
+    sigma = None if estimate is None else np.sqrt(np.diag(estimate.fixed_axes_covariance()).clip(min=0.0)).tolist()
+    return {
+        pattern.format(axis): None if sigma is None else sigma[part][k]
+        for part, pattern in _SIGMAS
+        for k, axis in enumerate("xyz")
+    }
 
 
 def row(recorded: Recorded) -> Row:
     """Return a state's cells by column; all rows have the same columns in the same order."""
     state = recorded.state
-    pose, estimate = state.T_chaser_target, estimate_of(state)
-    v, omega = state.v_chaser_target_m_s, state.omega_chaser_target_in_target_rad_s
-    sigma = None if estimate is None else np.sqrt(np.diag(estimate.fixed_axes_covariance()).clip(min=0.0))
-    t = None if pose is None else pose.translation_m
-    q = None if pose is None else pose.rotation_wxyz
+    pose = state.T_chaser_target
     cells: Row = {
         "t_capture_ns": state.t_capture_ns,
         "sequence": recorded.sequence,
@@ -60,12 +64,11 @@ def row(recorded: Recorded) -> Row:
         "age_s": state.age_s,
         "hypothesis_probability": state.hypothesis_probability,
     }
-    cells |= _named("translation_{}_m", None if t is None else (t.x, t.y, t.z))
-    cells |= _named("rotation_{}", None if q is None else (q.w, q.x, q.y, q.z), axes="wxyz")
-    cells |= _named("v_chaser_target_{}_m_s", None if v is None else (v.x, v.y, v.z))
-    cells |= _named("omega_chaser_target_in_target_{}_rad_s", None if omega is None else (omega.x, omega.y, omega.z))
-    for part, pattern in _SIGMAS:
-        cells |= _named(pattern, None if sigma is None else sigma[part])
+    cells |= _components("translation_{}_m", None if pose is None else pose.translation_m)
+    cells |= _components("rotation_{}", None if pose is None else pose.rotation_wxyz, axes="wxyz")
+    cells |= _components("v_chaser_target_{}_m_s", state.v_chaser_target_m_s)
+    cells |= _components("omega_chaser_target_in_target_{}_rad_s", state.omega_chaser_target_in_target_rad_s)
+    cells |= _sigmas(state)
     cells |= {
         "nis": state.nis,
         "nis_dof": state.nis_dof,

@@ -44,7 +44,15 @@ UPPER = np.triu_indices(12)
 _BODY = struct.Struct("<4sHBBqq93d")
 _TAIL = struct.Struct("<II")
 PACKET_BYTES = _BODY.size + _TAIL.size
-_NO_NUMBERS = (math.nan,) * (3 + 4 + 3 + 3 + len(UPPER[0]))
+_PARTS = {
+    "translation_m": slice(0, 3),
+    "rotation_wxyz": slice(3, 7),
+    "v_chaser_target_m_s": slice(7, 10),
+    "omega_chaser_target_in_target_rad_s": slice(10, 13),
+    "covariance_upper": slice(13, 91),
+}
+"""Where they are in ``_numbers``."""
+_NO_NUMBERS = (math.nan,) * 91
 
 
 def packet(state: RelativeState, sequence: int) -> bytes:
@@ -73,6 +81,7 @@ def json_line(state: RelativeState, sequence: int) -> bytes:
     row, of the 12x12.  Numbers are null unless the mode is TRACK or COAST.  Some 2 kB: two fragments on Ethernet.
     """
     shared = _shared(state)
+    numbers = None if shared is None else _numbers(state, shared)
     fields: dict[str, Any] = {
         "version": VERSION,
         "sequence": sequence,
@@ -81,21 +90,9 @@ def json_line(state: RelativeState, sequence: int) -> bytes:
         "valid": trusted_estimate(state) is not None,
         "age_s": state.age_s,
         "hypothesis_probability": state.hypothesis_probability,
+        **{name: None if numbers is None else numbers[part] for name, part in _PARTS.items()},
+        "port": None if numbers is None or state.port is None else state.port.model_dump(),
     }
-    names = (
-        "translation_m",
-        "rotation_wxyz",
-        "v_chaser_target_m_s",
-        "omega_chaser_target_in_target_rad_s",
-        "covariance_upper",
-        "port",
-    )
-    fields |= dict.fromkeys(names)
-    if shared is not None:
-        numbers = _numbers(state, shared)
-        port = None if state.port is None else state.port.model_dump()
-        values = (numbers[0:3], numbers[3:7], numbers[7:10], numbers[10:13], numbers[13:], port)
-        fields |= dict(zip(names, values, strict=True))
     return json.dumps(fields, allow_nan=False, separators=(",", ":")).encode() + b"\n"
 
 
