@@ -65,6 +65,7 @@ from astratag.search import (
     NARROW,
     PLAIN,
     SLANTED,
+    STEEP,
     THIN,
     TINY,
     Binarisation,
@@ -280,7 +281,7 @@ class Detector:
         Those in uneven light are read cell by cell.
         """
         tried, left = np.zeros((0, 4, 2)), MAX_MATCHED
-        for how in (TINY, BROAD, SLANTED, THIN):
+        for how in (TINY, BROAD, SLANTED, THIN, STEEP):
             quads = quads_of(find_outlines(view.gray, how))
             found = self._search_relit(view, quads)
             if found:

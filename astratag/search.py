@@ -44,6 +44,7 @@ BROAD = Binarisation(smooth_px=1, window_px=31, offset=15, holes=True)
 TINY = Binarisation(scale=2.0, smooth_px=1, window_px=9, holes=True)
 """For squares of some 12 to 30 pixels."""
 SLANTED = Binarisation(scale=2.0, smooth_px=1, window_px=21, offset=15, holes=True)
+STEEP = Binarisation(scale=2.0, smooth_px=1, window_px=31, offset=20, holes=True)
 """For margins a pixel wide, of squares seen at more than 80 degrees."""
 THIN = Binarisation(scale=2.0, smooth_px=1, window_px=9)
 """For borders a pixel wide."""
