@@ -114,18 +114,21 @@ class SimCamera:
         counts = np.arange(ADC_MAX + 1, dtype=np.float32) / ADC_MAX
         self._codes = np.round(srgb_from_linear(counts) * 255).astype(np.uint8)
 
-    def picture(self, T_cam_target: Array, t_ns: int) -> NDArray[np.uint8]:
-        """Return the grey picture (height, width), sRGB, taken at ``t_ns`` with the target at a pose."""
+    def picture(self, T_cam_target: Array, t_ns: int, *, glare: float = 0.0) -> NDArray[np.uint8]:
+        """Return the grey picture (height, width), sRGB, taken at ``t_ns`` with the target at a pose.
+
+        ``glare`` is light that falls on the sensor everywhere: at 1 there is nothing else to be seen.
+        """
         light = np.full((self._camera.height, self._camera.width), self._light.sky, np.float32)
         nearest_last = sorted(self._bodies, key=lambda body: -float((T_cam_target @ body[2])[2, 3]))
         for panel, surface, T_target_marker in nearest_last:
             self._lay(light, panel, surface, T_cam_target @ T_target_marker)
-        return self._expose(light, t_ns)
+        return self._expose(light + np.float32(glare), t_ns)
 
-    def jpeg(self, T_cam_target: Array, t_ns: int) -> bytes:
+    def jpeg(self, T_cam_target: Array, t_ns: int, *, glare: float = 0.0) -> bytes:
         """Return ``picture`` as JPEG."""
         quality = [cv2.IMWRITE_JPEG_QUALITY, self._sensor.jpeg_quality]
-        encoded, data = cv2.imencode(".jpg", self.picture(T_cam_target, t_ns), quality)
+        encoded, data = cv2.imencode(".jpg", self.picture(T_cam_target, t_ns, glare=glare), quality)
         assert encoded
         return data.tobytes()
 

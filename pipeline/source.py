@@ -48,6 +48,8 @@ class Source(ABC):
     """
 
     live = False
+    closed_loop = False
+    """It needs the states of its own frames back, as a sink."""
 
     def __init__(self, mission: Mission, calibration: CameraCalibration, frame_count: int | None):
         self.mission = mission
