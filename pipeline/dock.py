@@ -13,10 +13,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.Log_pb2 import Log
 from numpy.typing import NDArray
 
 from astratag.transforms import exp_so3, inverse, rotation_from_wxyz
@@ -52,12 +52,17 @@ TRUTH_SIGMA = 1e-5
 BuildPlant = Callable[[DockScenario, Departure], Plant]
 
 
+def require_basilisk() -> None:
+    """Raise ValueError when Basilisk is not installed."""
+    if find_spec("Basilisk") is None:
+        raise ValueError("Basilisk is not installed: `uv sync --extra dock` installs it, or `pip install bsk`")
+
+
 def basilisk(scenario: DockScenario, departure: Departure) -> Plant:
     """Return Basilisk's plant.  Raises ValueError when Basilisk is not installed."""
-    try:
-        from pipeline.basilisk_plant import BasiliskPlant
-    except ModuleNotFoundError as error:
-        raise ValueError("Basilisk is not installed: `uv sync --extra dock`, or `pip install bsk`") from error
+    require_basilisk()
+    from pipeline.basilisk_plant import BasiliskPlant
+
     return BasiliskPlant(scenario, departure)
 
 
@@ -193,17 +198,16 @@ class DockSource(Source):
     def __init__(self, scenario: DockScenario, *, real_time: bool = False, build_plant: BuildPlant = basilisk):
         self.scenario, self.live = scenario, real_time
         self._build_plant = build_plant
-        self._start_ns = time.time_ns() + NS_PER_S if real_time else START_NS
-        self._camera = scenario.camera.camera()
         self._states: list[tuple[int, RelativeState]] = []
         self._newest_state, self._newest_frame = -1, -1
-        mission = scenario.mission
-        calibration = calibration_message(self._camera, frame_id=mission.camera.name, t_capture_ns=self._start_ns)
-        super().__init__(mission, calibration, None)
+        camera, name = scenario.camera.camera(), scenario.mission.camera.name
+        super().__init__(
+            scenario.mission, calibration_message(camera, frame_id=name, t_capture_ns=START_NS), frame_count=None
+        )
 
     @property
     def waits(self) -> bool:
-        """Tell whether, in lockstep, a state must still come before the loop goes on."""
+        """Tell whether, in lockstep, the state of a frame before the newest has yet to come."""
         return not self.live and self._newest_state < self._newest_frame - 1
 
     def write(self, envelope: Envelope, t_receipt_ns: int) -> None:
@@ -214,15 +218,15 @@ class DockSource(Source):
             self._states.append((envelope.stamp.sequence, state))
             self._newest_state = max(self._newest_state, envelope.stamp.sequence)
 
-    def close(self) -> None:
-        """Nothing to finish."""
-
     def envelopes(self) -> Iterator[Envelope]:
-        """Yield the calibration, then truth, frame and guidance of every tick until the flight is over."""
-        yield self._wrap(self.calibration, 0, self._start_ns)
-        loop = Loop(self.scenario, self._start_ns, self._build_plant)
-        eye = ScriptedEye(self.scenario)
-        sequence, phase = -1, Phase.ACQUIRE
+        """Yield the calibration, then truth, frame and guidance of every tick until the flight is over.
+
+        In real time the flight begins now, and who draws the envelopes waits until each is due.
+        """
+        start_ns = time.time_ns() if self.live else START_NS
+        loop, eye = Loop(self.scenario, start_ns, self._build_plant), ScriptedEye(self.scenario)
+        yield self._wrap(self.calibration, 0, start_ns)
+        sequence = -1
         while True:
             t_ns, truth = loop.t_ns, loop.look()
             data = eye.look(loop.flight.relative, loop.t_s, t_ns)
@@ -237,9 +241,6 @@ class DockSource(Source):
                 loop.bridge.take_state(state)
             guidance = loop.act()
             yield self._wrap(guidance, max(sequence, 0), t_ns)
-            if guidance.phase is not phase:
-                phase = guidance.phase
-                yield self._wrap(_event(guidance), max(sequence, 0), t_ns)
             if loop.is_over(guidance):
                 return
 
@@ -312,10 +313,3 @@ def axial_m(scenario: DockScenario, relative: RelativeMotion) -> float:
     port = port_to_port(scenario.mission, relative.T_a_b, relative.v_a_b_m_s, relative.omega_a_b_in_b_rad_s)
     return port.axial_m
 
-
-def _event(guidance: Guidance) -> Log:
-    warning = guidance.phase in (Phase.HOLD, Phase.RETREAT, Phase.SAFE)
-    event = Log(level=Log.WARNING if warning else Log.INFO, name="guidance")
-    event.message = f"{guidance.phase.name}: {guidance.reason}"
-    event.timestamp.FromNanoseconds(guidance.t_capture_ns)
-    return event

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field, model_validator
 
-from astratag.camera import Camera
 from pipeline.mission import (
     CameraSection,
     CorridorSection,
@@ -23,7 +22,7 @@ from pipeline.mission import (
     Section,
     read_sections,
 )
-from pipeline.sim_camera import LightSection, SensorSection
+from pipeline.sim_camera import LightSection, SensorSection, SimCameraSection
 
 MU_EARTH_M3_S2 = 3.986004418e14
 EARTH_RADIUS_M = 6_378_136.6
@@ -87,25 +86,6 @@ class StartSection(Section):
     attitude_sigma_rad: float = Field(default=0.01, ge=0)
     known_position_sigma_m: float = Field(default=0.3, gt=0)
     known_velocity_sigma_m_s: float = Field(default=0.01, gt=0)
-
-
-class SimCameraSection(Section):
-    """The simulated camera."""
-
-    width_px: int = Field(default=640, gt=0)
-    height_px: int = Field(default=480, gt=0)
-    focal_px: float = Field(default=1200.0, gt=0)
-    distortion: tuple[float, float, float, float, float] = (-0.08, 0.05, 0.0, 0.0, 0.0)
-    rate_hz: float = Field(default=10.0, gt=0)
-
-    def camera(self) -> Camera:
-        """Return the calibrated camera, its axis through the middle of the picture."""
-        K = [
-            [self.focal_px, 0, (self.width_px - 1) / 2],
-            [0, self.focal_px, (self.height_px - 1) / 2],
-            [0, 0, 1],
-        ]
-        return Camera(np.array(K, float), self.distortion, width=self.width_px, height=self.height_px)
 
 
 class BlindSection(Section):

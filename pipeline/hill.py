@@ -7,6 +7,7 @@ velocity (m/s, as seen in the turning frame) of the chaser, (6,).
 from __future__ import annotations
 
 from collections import deque
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ Array = NDArray[np.float64]
 POSITION, VELOCITY = slice(0, 3), slice(3, 6)
 
 
+@lru_cache(maxsize=64)
 def clohessy_wiltshire(rate_rad_s: float, dt_s: float) -> tuple[Array, Array]:
     """Return how a state (6,) becomes one ``dt_s`` later, Phi (6, 6), and what a constant acceleration adds, (6, 3).
 

@@ -42,7 +42,7 @@ def replay_direct(
     on_refused: Callable[[str], None] = lambda reason: None,
     steps: Sequence[StepSpec] = STEPS,
 ) -> ReplayCounts:
-    """Run a source through the steps into the sinks; ``on_frame`` is called when a frame is through, ``on_refused``
+    """Run a source through the steps into the sinks, and back to the source; ``on_frame`` is called when a frame is through, ``on_refused``
     with the reason when a step cannot use a message.
 
     ``speed`` is a multiple of the recorded pace.  The sinks stay open: they are the caller's.
@@ -59,7 +59,7 @@ def replay_direct(
         queue = deque([entered])
         while queue:
             current = queue.popleft()
-            for sink in sinks:
+            for sink in (*sinks, source):
                 try:
                     sink.write(current, time.time_ns())
                 except CodecError as error:

@@ -65,6 +65,25 @@ class SensorSection(Section):
     jpeg_quality: int = Field(default=95, ge=1, le=100)
 
 
+class SimCameraSection(Section):
+    """The simulated camera."""
+
+    width_px: int = Field(default=640, gt=0)
+    height_px: int = Field(default=480, gt=0)
+    focal_px: float = Field(default=1200.0, gt=0)
+    distortion: tuple[float, float, float, float, float] = (-0.08, 0.05, 0.0, 0.0, 0.0)
+    rate_hz: float = Field(default=10.0, gt=0)
+
+    def camera(self) -> Camera:
+        """Return the calibrated camera, its axis through the middle of the picture."""
+        K = [
+            [self.focal_px, 0, (self.width_px - 1) / 2],
+            [0, self.focal_px, (self.height_px - 1) / 2],
+            [0, 0, 1],
+        ]
+        return Camera(np.array(K, float), self.distortion, width=self.width_px, height=self.height_px)
+
+
 @dataclass(frozen=True, eq=False)
 class Panel:
     """A square picture on a surface with its centre at the origin, halved again and again; first row at largest y."""

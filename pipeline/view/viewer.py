@@ -26,8 +26,8 @@ from pipeline.view.geometry import ELLIPSOID_SCALE, SIGMAS, PortMotion, chaser_p
 from pipeline.view.overlay import Overlay
 from pipeline.view.scene import draw_corridor, draw_target, draw_vehicle, transform3d
 from pipeline.view.streams import LOCALHOST, Live, Warn, Window, open_file, serve_web
-from schemas import Detections, Envelope, RelativeState, Truth
-from schemas.topics import CALIBRATION, DETECTIONS, EVENTS, FRAME, STATE, TRUTH
+from schemas import Detections, Envelope, Guidance, Phase, RelativeState, Truth
+from schemas.topics import CALIBRATION, DETECTIONS, EVENTS, FRAME, GUIDANCE, STATE, TRUTH
 
 Array = NDArray[np.float64]
 ViewMode = Literal["native", "web", "none"]
@@ -96,6 +96,7 @@ class Viewer:
             DETECTIONS.name: self._draw_detections,
             STATE.name: self._draw_state,
             TRUTH.name: self._draw_truth,
+            GUIDANCE.name: self._draw_guidance,
             EVENTS.name: self._draw_event,
         }
         self._draw_static()
@@ -288,6 +289,13 @@ class Viewer:
     def _draw_event(self, message: Log, _envelope: Envelope, _t_ns: int) -> None:
         level = LOG_LEVELS.get(message.level, rr.TextLogLevel.INFO)
         self._log("events", rr.TextLog(message.message, level=level))
+
+    def _draw_guidance(self, guidance: Guidance, _envelope: Envelope, _t_ns: int) -> None:
+        if self._changed("phase", guidance.phase):
+            is_alarm = guidance.phase in (Phase.HOLD, Phase.RETREAT, Phase.SAFE)
+            level = rr.TextLogLevel.WARN if is_alarm else rr.TextLogLevel.INFO
+            self._log("events", rr.TextLog(f"{guidance.phase.name}: {guidance.reason}", level=level))
+            self._log(layout.GUIDANCE_PHASE, rr.StateChange(state=guidance.phase.name))
 
     def _draw_status(self, lane: str, status: str) -> None:
         if self._changed(lane, status):
