@@ -14,9 +14,9 @@ from Basilisk.simulation import extForceTorque, spacecraft
 from Basilisk.utilities import RigidBodyKinematics, SimulationBaseClass, simIncludeGravBody
 from numpy.typing import NDArray
 
+from pipeline.convert import NS_PER_S
 from pipeline.dock_scenario import DockScenario
 from pipeline.plant import Departure, Flight, hill_from_inertial
-from pipeline.convert import NS_PER_S
 
 Array = NDArray[np.float64]
 
@@ -42,7 +42,9 @@ class BasiliskPlant:
         self._depart(scenario, departure)
         self._simulation.InitializeSimulation()
 
-    def _add_spacecraft(self, name: str, mass_kg: float, inertia_kg_m2: tuple[float, float, float]) -> spacecraft.Spacecraft:
+    def _add_spacecraft(
+        self, name: str, mass_kg: float, inertia_kg_m2: tuple[float, float, float]
+    ) -> spacecraft.Spacecraft:
         body = spacecraft.Spacecraft()
         body.ModelTag = name
         body.hub.mHub = mass_kg

@@ -58,7 +58,9 @@ def port_to_port(
         hold_point_m=next_hold_point_m(mission.corridor, float(p[2])),
     )
     rate_rad_s = float(np.linalg.norm(omega_chaser_target_in_target_rad_s))
-    return port.model_copy(update={"in_docking_box": not box_violations(mission.corridor.docking_box, port, rate_rad_s)})
+    return port.model_copy(
+        update={"in_docking_box": not box_violations(mission.corridor.docking_box, port, rate_rad_s)}
+    )
 
 
 def in_corridor(corridor: CorridorSection, *, axial_m: float, lateral_m: float) -> bool:

@@ -44,7 +44,7 @@ DISTURBANCE_M_S2 = 3e-4
 """What the bridge allows for beside the orbit and the thrust, held for a tick."""
 TARGET_PRIOR_RAD = 0.05
 TARGET_DRIFT_RAD_SQRT_S = 3e-4
-GAP_S = 0.35
+GAP_TICKS = 3.5
 """Measurements farther apart are not without a gap."""
 TRUTH_SIGMA = 1e-5
 """Standard deviation, m, rad, m/s and rad/s, that a flight on truth claims."""
@@ -81,7 +81,9 @@ class Draw:
         """Return the draw of a scenario's seed."""
         rng = np.random.default_rng((scenario.seed, 1))
         start, target, chaser, mission = scenario.start, scenario.target, scenario.chaser, scenario.mission
-        R_hill_target = rotation_from_wxyz(target.R_hill_target_wxyz) @ exp_so3(rng.normal(0, target.attitude_sigma_rad, 3))
+        R_hill_target = rotation_from_wxyz(target.R_hill_target_wxyz) @ exp_so3(
+            rng.normal(0, target.attitude_sigma_rad, 3)
+        )
         T_target_port, T_chaser_port = mission.T_target_port.matrix(), mission.T_chaser_port.matrix()
         facing = R_hill_target @ T_target_port[:3, :3] @ PORTS_FACING @ T_chaser_port[:3, :3].T
         R_hill_chaser = facing @ exp_so3(rng.normal(0, start.attitude_sigma_rad, 3))
@@ -123,7 +125,7 @@ class Loop:
         target = TargetAttitude(
             nominal, TARGET_PRIOR_RAD, start_ns, inflation=STATE_INFLATION, drift_rad_sqrt_s=TARGET_DRIFT_RAD_SQRT_S
         )
-        self.bridge = NavigationBridge(orbit, target, gap_s=GAP_S)
+        self.bridge = NavigationBridge(orbit, target, gap_s=GAP_TICKS / scenario.camera.rate_hz)
         self.autopilot = Autopilot(scenario.mission, scenario.chaser, scenario.guidance, scenario.safety, start_ns)
         self.flight = self._plant.flight()
 
@@ -312,4 +314,3 @@ def axial_m(scenario: DockScenario, relative: RelativeMotion) -> float:
     """Return how far apart the ports are along the target port's axis."""
     port = port_to_port(scenario.mission, relative.T_a_b, relative.v_a_b_m_s, relative.omega_a_b_in_b_rad_s)
     return port.axial_m
-

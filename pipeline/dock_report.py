@@ -89,8 +89,7 @@ def judge(
         contact=ports[-1] if is_contact else None,
         angular_rate_rad_s=rate_rad_s if is_contact else None,
         closest_m=min(port.axial_m for port in ports),
-        outside_corridor_s=tick_s
-        * sum(p.in_keep_out_sphere and not p.in_corridor and p.axial_m > 0 for p in ports),
+        outside_corridor_s=tick_s * sum(p.in_keep_out_sphere and not p.in_corridor and p.axial_m > 0 for p in ports),
         duration_s=(last.t_capture_ns - start_ns) / NS_PER_S,
         delta_v_m_s=last.delta_v_m_s,
         delta_v_on_truth_m_s=on_truth_m_s,

@@ -114,10 +114,10 @@ class GuidanceSection(Section):
     """At each hold point of the corridor."""
     arrival_m: float = Field(default=0.1, gt=0)
     """A hold point is reached when nearer than this."""
-    position_gain_hz: float = Field(default=0.08, gt=0)
+    position_gain_hz: float = Field(default=0.1, gt=0)
     """Speed towards a place for each metre that it is away."""
     lateral_speed_max_m_s: float = Field(default=0.03, gt=0)
-    velocity_deadband_m_s: float = Field(default=0.004, gt=0)
+    velocity_deadband_m_s: float = Field(default=0.003, gt=0)
     """No thrust below this velocity error along an axis; once begun, thrust goes on to a quarter of it."""
     response_s: float = Field(default=2.0, gt=0)
     """Time in which a velocity error is taken out."""
@@ -156,7 +156,7 @@ DOCK_MISSION = Mission(
     T_chaser_port=PoseSection(translation_m=(1.0, 0.0, 0.0), rotation_wxyz=FORWARD),
     T_target_port=PoseSection(translation_m=(0.0, 0.0, 1.0)),
     corridor=CorridorSection(start_m=20.0, port_radius_m=0.2, hold_points_m=(8.0, 2.0), keep_out_radius_m=10.0),
-    filter=FilterSection(acceleration_m_s2=0.01, angular_acceleration_rad_s2=0.002),
+    filter=FilterSection(acceleration_m_s2=0.01, angular_acceleration_rad_s2=0.002, edge_bias_px=0.06),
 )
 """Camera and marker lie back in their ports, so that the marker's inner layers stay in view: 0.5 m apart at contact."""
 
@@ -169,7 +169,7 @@ class DockScenario(Section):
     chaser: ChaserSection = ChaserSection()
     target: TargetSection = TargetSection()
     start: StartSection = StartSection()
-    camera: SimCameraSection = SimCameraSection()
+    camera: SimCameraSection = SimCameraSection(rate_hz=5.0)
     light: LightSection = LightSection()
     sensor: SensorSection = SensorSection()
     faults: FaultSection = FaultSection()

@@ -5,7 +5,6 @@ Axial is along the target port's axis outward, lateral across it; both of the ch
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +15,7 @@ from pipeline.bridge import Navigation
 from pipeline.convert import NS_PER_S
 from pipeline.dock_scenario import ChaserSection, GuidanceSection, SafetySection
 from pipeline.mission import Mission
-from schemas import Mode, Phase
+from schemas import Phase
 
 Array = NDArray[np.float64]
 
@@ -113,7 +112,10 @@ class Autopilot:
         doubt = self._doubt(navigation, place)
         held_s = self.phase_s(navigation.t_ns)
         is_confirmed = not doubt and navigation.fresh_s >= self._safety.confirm_s
-        go: Callable[[Phase, str], None] = lambda phase, reason: self._enter(phase, reason, navigation.t_ns, place)
+
+        def go(phase: Phase, reason: str) -> None:
+            self._enter(phase, reason, navigation.t_ns, place)
+
         match self._phase:
             case Phase.ACQUIRE if is_confirmed:
                 go(Phase.APPROACH, "the state is confirmed")
@@ -142,7 +144,9 @@ class Autopilot:
             return navigation.refused
         if navigation.age_s > safety.coast_limit_s:
             return f"{navigation.mode.name}: no measurement for {navigation.age_s:.1f} s"
-        limit_m = max(safety.position_sigma_limit_m, safety.position_sigma_limit_share * float(np.linalg.norm(place.p_m)))
+        limit_m = max(
+            safety.position_sigma_limit_m, safety.position_sigma_limit_share * float(np.linalg.norm(place.p_m))
+        )
         if navigation.position_sigma_m > limit_m:
             return f"position known to {navigation.position_sigma_m:.2f} m only"
         return ""
@@ -188,7 +192,9 @@ class Autopilot:
             return 0.0
         if self._holds_m:
             to_go_m = max(place.axial_m - self._holds_m[0], 0.0)
-            braked_m_s = min(float(np.sqrt(2 * guidance.braking_m_s2 * to_go_m)), 2 * guidance.position_gain_hz * to_go_m)
+            braked_m_s = min(
+                float(np.sqrt(2 * guidance.braking_m_s2 * to_go_m)), 2 * guidance.position_gain_hz * to_go_m
+            )
             return min(guidance.cruise_speed_m_s, braked_m_s)
         contact_m_s = guidance.contact_speed_m_s
         braked_m_s = float(np.sqrt(contact_m_s**2 + 2 * guidance.braking_m_s2 * max(place.axial_m, 0.0)))

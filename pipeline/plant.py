@@ -60,7 +60,7 @@ class Flight:
         """Return the flight of two bodies: positions and velocities in inertial axes, rates in body axes."""
         R_hill_inertial = hill_from_inertial(r_target, v_target)
         omega_hill = np.cross(r_target, v_target) / (r_target @ r_target)
-        R_chaser_inertial, R_target_inertial = R_inertial_chaser.T, R_inertial_target.T
+        R_chaser_inertial = R_inertial_chaser.T
         r, v = r_chaser - r_target, v_chaser - v_target
         in_chaser = R_chaser_inertial @ -r
         R_chaser_target = R_chaser_inertial @ R_inertial_target

@@ -97,8 +97,8 @@ class Panel:
         ink = np.round(255 * BLACK_ALBEDO + (WHITE_ALBEDO - BLACK_ALBEDO) * np.arange(256)).astype(np.uint8)
         print_albedo = ink[print_coverage(signature, TEXELS_PER_UNIT)]
         size = print_albedo.shape[0]
-        margin = [round(size * (PANEL_SHARE - 1) / 2)] * 4
-        levels = [cv2.copyMakeBorder(print_albedo, *margin, cv2.BORDER_CONSTANT, value=round(255 * panel_albedo))]
+        m = round(size * (PANEL_SHARE - 1) / 2)
+        levels = [cv2.copyMakeBorder(print_albedo, m, m, m, m, cv2.BORDER_CONSTANT, value=round(255 * panel_albedo))]
         width_m = side_m * PRINT_UNITS / TEMPLATE_UNITS * levels[0].shape[0] / size
         while levels[-1].shape[0] >= 16:
             half = levels[-1].shape[0] // 2
@@ -130,7 +130,7 @@ class SimCamera:
         rng = np.random.default_rng(seed)
         shape = (camera.height + NOISE_MARGIN_PX, camera.width + NOISE_MARGIN_PX)
         self._noise = rng.standard_normal(shape, dtype=np.float32)
-        counts = np.arange(ADC_MAX + 1, dtype=np.float32) / ADC_MAX
+        counts = (np.arange(ADC_MAX + 1) / ADC_MAX).astype(np.float32)
         self._codes = np.round(srgb_from_linear(counts) * 255).astype(np.uint8)
 
     def picture(self, T_cam_target: Array, t_ns: int, *, glare: float = 0.0) -> NDArray[np.uint8]:
@@ -188,9 +188,10 @@ class SimCamera:
         texels = picture.shape[0]
         at_x = (x_m / panel.width_m + 0.5) * texels - 0.5
         at_y = (0.5 - y_m / panel.width_m) * texels - 0.5
-        maps = [_upsampled(at.astype(np.float32), cells)[: behind.shape[0], : behind.shape[1]] for at in (at_x, at_y)]
-        read = cv2.remap(picture, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        inside = (maps[0] > -0.5) & (maps[0] < texels - 0.5) & (maps[1] > -0.5) & (maps[1] < texels - 0.5)
+        rows, columns = behind.shape
+        map_x, map_y = (_upsampled(at.astype(np.float32), cells)[:rows, :columns] for at in (at_x, at_y))
+        read = cv2.remap(picture, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        inside = (map_x > -0.5) & (map_x < texels - 0.5) & (map_y > -0.5) & (map_y < texels - 0.5)
         return np.where(inside, read * np.float32(self._light.brightness / 255), behind)
 
     def _expose(self, light: Image, t_ns: int) -> NDArray[np.uint8]:
@@ -206,7 +207,7 @@ class SimCamera:
 
 
 def _grid_rays(camera: Camera) -> tuple[Array, Array, Array]:
-    """Return x/z and y/z of rays (R, C, 2) on a grid that encloses the picture, and their change a pixel right and down.
+    """Return x/z and y/z of rays (R, C, 2) on a grid around the picture, and their change a pixel right and down.
 
     Cell k stands for pixels 4 (k - 1) to 4 (k - 1) + 3: its ray goes through their middle.
     """

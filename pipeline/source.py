@@ -75,10 +75,10 @@ class Source(ABC):
         """Tell whether a closed loop cannot go on before another state has been written to it."""
         return False
 
-    def write(self, envelope: Envelope, t_receipt_ns: int) -> None:
+    def write(self, envelope: Envelope, t_receipt_ns: int) -> None:  # noqa: B027
         """Take what the pipeline made of the frames so far; of use to a closed loop only."""
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027
         """Nothing to finish."""
 
     def _warn(self, line: str) -> None:

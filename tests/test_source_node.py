@@ -113,6 +113,7 @@ class Film:
     """A source of frames in memory."""
 
     live = False
+    closed_loop = False
 
     def __init__(self, frames: int):
         self.frames = frames
