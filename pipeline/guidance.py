@@ -118,6 +118,7 @@ class Autopilot:
 
         match self._phase:
             case Phase.ACQUIRE if is_confirmed:
+                self._holds_m = [hold for hold in self._holds_m if hold < place.axial_m]
                 go(Phase.APPROACH, "the state is confirmed")
             case Phase.ACQUIRE if held_s > self._safety.acquire_limit_s:
                 go(Phase.RETREAT, f"no confirmed state for {held_s:.0f} s: {doubt}")
