@@ -227,7 +227,8 @@ def _plan(
 
 
 def _print_header(console: Console, subject: Subject, args: argparse.Namespace, view: View, how: str) -> None:
-    frames = "live" if subject.frame_count is None else f"{subject.frame_count} frames"
+    endless = "live" if subject.live else "closed loop"
+    frames = endless if subject.frame_count is None else f"{subject.frame_count} frames"
     console.print(f"[bold]{escape(subject.spec)}[/bold]: {frames}, {how}, results in {escape(str(args.out))}")
     if view == "native":
         console.print("Rerun's window opens beside this")

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from astratag.transforms import skew, transform
 from pipeline.convert import NS_PER_S, pose_matrix
 from pipeline.hill import POSITION, RelativeOrbit, TargetAttitude
 from schemas import Mode, RelativeState
@@ -22,8 +23,11 @@ FLOWN_MODES = (Mode.TRACK,)
 """Modes in which a state counts as a measurement.  COAST is no measurement: the bridge reckons better by itself, as it
 knows the thrust.  AMBIGUOUS, INIT and LOST are none at all."""
 ATTITUDES_KEPT = 64
-ATTITUDE_KNOWLEDGE_RAD = 3e-4
+OWN_ATTITUDE_SIGMA_RAD = 3e-4
 """How well the chaser knows its own attitude: what a far target's place in the Hill frame is uncertain by."""
+TILT_SIGMA_RAD_M = 0.004
+"""What a marker's tilt may be off by for each metre of range, whatever the pose filter says: a distant print looks much
+the same tilted the other way."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +63,12 @@ class Navigation:
 class NavigationBridge:
     """Relative states and the chaser's own attitude in, navigation out.  No clock."""
 
-    def __init__(self, orbit: RelativeOrbit, target: TargetAttitude, *, gap_s: float):
+    def __init__(
+        self, orbit: RelativeOrbit, target: TargetAttitude, *, gap_s: float, p_target_marker_m: Array | None = None
+    ):
+        """``p_target_marker_m`` is the middle of the markers, target axes: what is seen is there, whatever its tilt."""
         self._orbit, self._target, self._gap_s = orbit, target, gap_s
+        self._p_target_marker_m = np.zeros(3) if p_target_marker_m is None else p_target_marker_m
         self._own: OrderedDict[int, OwnAttitude] = OrderedDict()
         self._mode, self._refused = Mode.INIT, "no state yet"
         self._t_measured_ns: int | None = None
@@ -115,13 +123,16 @@ class NavigationBridge:
         own = self._own.get(state.t_capture_ns)
         if own is None:
             return "the chaser's attitude at that time is not known"
-        T_chaser_target, cov = pose_matrix(state.T_chaser_target), np.array(state.covariance).reshape(12, 12)
+        T_chaser_target, cov = pose_matrix(state.T_chaser_target), np.array(state.covariance).reshape(12, 12)[:6, :6]
         R_hill_target = own.R_hill_chaser @ T_chaser_target[:3, :3]
-        r_hill_m = -own.R_hill_chaser @ T_chaser_target[:3, 3]
-        swing = (ATTITUDE_KNOWLEDGE_RAD**2) * (r_hill_m @ r_hill_m * np.eye(3) - np.outer(r_hill_m, r_hill_m))
-        if not self._orbit.measure(state.t_capture_ns, r_hill_m, R_hill_target @ cov[:3, :3] @ R_hill_target.T + swing):
-            return "the state contradicts the orbit and the thrust so far"
-        knowledge = ATTITUDE_KNOWLEDGE_RAD**2 * np.eye(3)
-        if not self._target.measure(state.t_capture_ns, R_hill_target, cov[3:6, 3:6] + knowledge):
+        sight_hill_m = own.R_hill_chaser @ transform(T_chaser_target, self._p_target_marker_m)
+        range_m = float(np.linalg.norm(sight_hill_m))
+        floor = (OWN_ATTITUDE_SIGMA_RAD**2 + (TILT_SIGMA_RAD_M * range_m) ** 2) * np.eye(3)
+        if not self._target.measure(state.t_capture_ns, R_hill_target, cov[3:, 3:] + floor):
             return "the attitude contradicts what it was so far"
+        by_pose = R_hill_target @ np.hstack([np.eye(3), -skew(self._p_target_marker_m)])
+        swing = OWN_ATTITUDE_SIGMA_RAD**2 * (range_m**2 * np.eye(3) - np.outer(sight_hill_m, sight_hill_m))
+        r_hill_m = self._target.R_hill_target @ self._p_target_marker_m - sight_hill_m
+        if not self._orbit.measure(state.t_capture_ns, r_hill_m, by_pose @ cov @ by_pose.T + swing):
+            return "the position contradicts the orbit and the thrust so far"
         return ""

@@ -38,8 +38,8 @@ Array = NDArray[np.float64]
 
 START_NS = 1_783_814_400 * NS_PER_S
 """2026-07-12T00:00:00Z, when every run in lockstep begins."""
-STATE_INFLATION = 10.0
-"""How many frames the errors of the pose filter last."""
+POSITION_INFLATION, ATTITUDE_INFLATION = 10.0, 300.0
+"""How many frames the errors of the pose filter last: a tilt that is read wrongly stays so until it is seen nearer."""
 DISTURBANCE_M_S2 = 3e-4
 """What the bridge allows for beside the orbit and the thrust, held for a tick."""
 TARGET_PRIOR_RAD = 0.05
@@ -117,15 +117,18 @@ class Loop:
             np.diag([start.known_position_sigma_m**2] * 3 + [start.known_velocity_sigma_m_s**2] * 3),
             start_ns,
             rate_rad_s=scenario.orbit.rate_rad_s,
-            inflation=STATE_INFLATION,
+            inflation=POSITION_INFLATION,
             disturbance_m_s2=DISTURBANCE_M_S2,
             thrust_error_share=2 * scenario.chaser.force_scale_sigma,
         )
         nominal = rotation_from_wxyz(scenario.target.R_hill_target_wxyz)
         target = TargetAttitude(
-            nominal, TARGET_PRIOR_RAD, start_ns, inflation=STATE_INFLATION, drift_rad_sqrt_s=TARGET_DRIFT_RAD_SQRT_S
+            nominal, TARGET_PRIOR_RAD, start_ns, inflation=ATTITUDE_INFLATION, drift_rad_sqrt_s=TARGET_DRIFT_RAD_SQRT_S
         )
-        self.bridge = NavigationBridge(orbit, target, gap_s=GAP_TICKS / scenario.camera.rate_hz)
+        middle = np.mean([marker.T_target_marker.translation_m for marker in scenario.mission.markers], axis=0)
+        self.bridge = NavigationBridge(
+            orbit, target, gap_s=GAP_TICKS / scenario.camera.rate_hz, p_target_marker_m=middle
+        )
         self.autopilot = Autopilot(scenario.mission, scenario.chaser, scenario.guidance, scenario.safety, start_ns)
         self.flight = self._plant.flight()
 

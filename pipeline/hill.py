@@ -102,7 +102,10 @@ class RelativeOrbit:
 
 
 class TargetAttitude:
-    """The target's attitude in the Hill frame, which hardly changes: a mean of what was measured, and of a prior."""
+    """The target's attitude in the Hill frame, which hardly changes: a mean of what was measured, and of a prior.
+
+    The errors of a measured attitude last long: each counts for little, ``inflation`` times its covariance.
+    """
 
     GATE = float(chi2.ppf(1 - 1e-5, df=3))
 
@@ -121,10 +124,9 @@ class TargetAttitude:
         dt_s = max(t_ns - self._t_ns, 0) / NS_PER_S
         P = self._P + self._drift_rad_sqrt_s**2 * dt_s * np.eye(3)
         innovation = log_so3(self.R_hill_target.T @ R_hill_target)
-        S = P + self._inflation * cov
-        if float(innovation @ np.linalg.solve(S, innovation)) > self.GATE:
+        if float(innovation @ np.linalg.solve(P + cov, innovation)) > self.GATE:
             return False
-        K = np.linalg.solve(S, P).T
+        K = np.linalg.solve(P + self._inflation * cov, P).T
         self.R_hill_target = self.R_hill_target @ exp_so3(K @ innovation)
         self._P, self._t_ns = (np.eye(3) - K) @ P, t_ns
         return True

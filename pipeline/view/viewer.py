@@ -156,7 +156,7 @@ class Viewer:
             self._log(path, lane, static=True)
         self._log(layout.SCENE, rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
         self._log(f"{layout.SCENE}/target", transform3d(chaser_pose(np.eye(4), self._T_target_port)), static=True)
-        draw_corridor(self._log, self._mission.corridor)
+        draw_corridor(self._log, self._mission.corridor, self._T_target_port)
         markers = [(m.id, m.T_target_marker.matrix(), m.side_m, m.surface.surface()) for m in self._mission.markers]
         draw_target(self._log, markers, load_dictionary(self._mission.dictionary))
         draw_vehicle(self._log, layout.ESTIMATE, self._T_chaser_port, color=layout.ESTIMATE_COLOR, width=1.2)
