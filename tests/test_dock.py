@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from tests.fake_plant import FakePlant
 
 from pipeline.bridge import NavigationBridge
 from pipeline.convert import NS_PER_S
@@ -14,6 +13,7 @@ from pipeline.dock_scenario import BlindSection, DockScenario, FaultSection, Sta
 from pipeline.replay import replay_direct
 from schemas import Envelope, Guidance, Mode, Phase, RelativeState, Truth
 from schemas.topics import FRAME, GUIDANCE, STATE
+from tests.fake_plant import FakePlant
 
 SHORT = DockScenario(start=StartSection(axial_m=4.0, position_sigma_m=0.1), seed=3)
 Distort = Callable[[float, RelativeState], RelativeState | None]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -61,7 +62,7 @@ def draw_corridor(log: Log, corridor: CorridorSection, T_target_port: Array) -> 
     )
     log(f"{SCENE}/corridor", veil, static=True)
     log(f"{SCENE}/corridor/edges", edges, static=True)
-    thin = {"colors": faint(CORRIDOR_COLOR, 0xD0), "radii": rr.Radius.ui_points(1.0)}
+    thin: dict[str, Any] = {"colors": faint(CORRIDOR_COLOR, 0xD0), "radii": rr.Radius.ui_points(1.0)}
     if corridor.hold_points_m:
         log(f"{SCENE}/corridor/hold_points", rr.LineStrips3D(hold_point_strips(corridor), **thin), static=True)
     if 0 < corridor.keep_out_radius_m <= LARGEST_SPHERE * corridor.start_m:
