@@ -34,7 +34,7 @@ from astratag.edges import Transfer, inverse_transfer
 from astratag.fit import measure_layers
 from astratag.geometry import LAYERS, TEMPLATE_UNITS, Layer, layer_points, square
 from astratag.grow import Fit, fit_own_edges, grow, layer_side_px, settle
-from astratag.matching import ACCEPT_OF_PIXELS, match
+from astratag.matching import acceptance_of_pixels, match
 from astratag.pose import planar_poses, poses_from_square, refine_on_corners
 from astratag.search import (
     BROAD,
@@ -161,6 +161,7 @@ class Detector:
         self._codebook = Codebook(self.dictionary)
         self._artwork = Artwork(self.dictionary)
         self._synthesis = Synthesis(self.dictionary)
+        self._accept_of_pixels = acceptance_of_pixels(4 * len(self.dictionary))
 
     def detect(self, image: NDArray[np.uint8], camera: Camera | None = None) -> list[Detection]:
         """Return the markers in a gray (H, W) or BGR (H, W, 3) uint8 image, the surest first; poses need ``camera``.
@@ -202,7 +203,7 @@ class Detector:
 
     def _confirm_pixels(self, view: View, quad: Array) -> Detection | None:
         """Return the marker that a rough quad (4, 2) is a layer of."""
-        seen = match(self._synthesis, view.light, quad, PIXEL_BLUR)
+        seen = match(self._synthesis, view.light, quad, PIXEL_BLUR, self._accept_of_pixels)
         if seen is None:
             return None
         return self._described_by_pixels(view, seen.marker_id, seen.alignment, seen.layer, seen.correlation, "planar")
@@ -214,7 +215,7 @@ class Detector:
             return None
         scores = self._synthesis.read(view.light, aligned.warp, aligned.blur_px)
         row = self.dictionary.row(marker_id)
-        if scores[row, 0] < ACCEPT_OF_PIXELS or scores.argmax() != 4 * row:
+        if scores[row, 0] < self._accept_of_pixels or scores.argmax() != 4 * row:
             return None
         return self._described_by_pixels(view, marker_id, aligned, 0, float(scores[row, 0]), method)
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from astratag.codes import acceptance_threshold
 from astratag.geometry import LAYERS, TEMPLATE_UNITS, square
 from astratag.synthesis import Alignment, Synthesis
 from astratag.warp import HomographyWarp
@@ -21,11 +22,8 @@ Light = NDArray[np.float32]
 
 WORTH_ALIGNING = 0.3
 """Correlation of the cells through a rough square from which it is worth aligning."""
-ACCEPT_OF_PIXELS = 0.78
-"""Correlation of the cells, aligned, that one chance square in a million exceeds.
-
-Extrapolated from 5000 squares of real texture: they correlate as 32 independent cells would.
-"""
+INDEPENDENT_CELLS = 36
+"""Chance squares correlate with codes as so many independent cells would: of 2700 of real texture, the best at 0.66."""
 LEAST_LEAD = 1.5
 """How many times more of the cells' brightness the next best identity must leave unexplained."""
 LEAST_LAYER_LEAD = 1.5
@@ -49,8 +47,16 @@ class Match(NamedTuple):
     alignment: Alignment[HomographyWarp]
 
 
-def match(synthesis: Synthesis, light: Light, quad: Array, blur_px: float) -> Match | None:
-    """Return the marker that a rough square (4, 2) is a layer of, None when it is none for sure."""
+def acceptance_of_pixels(readings: int) -> float:
+    """Return the correlation of the cells, aligned, that one chance square in a million exceeds."""
+    return acceptance_threshold(readings, cells=INDEPENDENT_CELLS)
+
+
+def match(synthesis: Synthesis, light: Light, quad: Array, blur_px: float, accept: float) -> Match | None:
+    """Return the marker that a rough square (4, 2) is a layer of, None when it is none for sure.
+
+    ``accept`` is the correlation of the cells from which they are believed.
+    """
     warp = HomographyWarp.from_points(OUTER, quad)
     if _side_px(warp) < LEAST_SIDE_PX:
         return None
@@ -70,7 +76,7 @@ def match(synthesis: Synthesis, light: Light, quad: Array, blur_px: float) -> Ma
             break
     correlation = float(scores[row, 0])
     scores[row, 0] = 0.0
-    if correlation < ACCEPT_OF_PIXELS or _lead(correlation, float(scores.max())) < LEAST_LEAD:
+    if correlation < accept or _lead(correlation, float(scores.max())) < LEAST_LEAD:
         return None
     by_layer = synthesis.layer_scores(light, warp, marker_id, blur_px)
     layer = int(by_layer.argmax())

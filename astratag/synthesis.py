@@ -273,7 +273,11 @@ class Synthesis:
         rows = np.arange(len(labels), dtype=np.int64)[:, None] * LABELS + labels
         share = np.bincount(rows.ravel(), minlength=len(labels) * LABELS).reshape(-1, LABELS) / MANY_NODES
         nuisance = np.column_stack([seen.plane, share[:, BLACK:]])  # the shares add up to one
-        return _correlations(seen, nuisance, _values(light, seen), share[:, :CELLS] @ self._codes.T).reshape(-1, 4)
+        left = _left(seen, nuisance, np.column_stack([share[:, :CELLS], _values(light, seen)]))
+        B, value = left[:, :CELLS], left[:, CELLS]
+        gram, common = B.T @ B, B.T @ value
+        length = np.sqrt(((self._codes @ gram) * self._codes).sum(axis=1) * (value @ value))
+        return (self._codes @ common / np.maximum(length, 1e-9)).reshape(-1, 4)
 
     def layer_scores(self, light: Light, square_warp: FittedWarp, marker_id: int, blur_px: float) -> Array:
         """Return how well (3,) a square and what surrounds it fit it being layer 0, 1 or 2, as correlations.
@@ -355,13 +359,6 @@ def _left(seen: Look, nuisance: Array, columns: Array) -> Array:
     Q = np.linalg.qr(nuisance * seen.root[:, None])[0]
     columns = columns * seen.root[:, None]
     return columns - Q @ (Q.T @ columns)
-
-
-def _correlations(seen: Look, nuisance: Array, value: Array, looks: Array) -> Array:
-    """Return the correlations (K,) of values (N,) with how they should look (N, K), a nuisance (N, M) taken out."""
-    columns = _left(seen, nuisance, np.column_stack([value, looks]))
-    length = np.maximum(np.sqrt(np.einsum("nk,nk->k", columns, columns)), 1e-9)
-    return columns[:, 0] @ columns[:, 1:] / (length[0] * length[1:])
 
 
 def _contrast(seen: Look, nuisance: Array, value: Array, looks: Array) -> tuple[float, float]:
