@@ -100,14 +100,18 @@ class Draw:
         )
 
 
+def depart(scenario: DockScenario, build_plant: BuildPlant = basilisk) -> Plant:
+    """Return the simulator at the start of a scenario's flight."""
+    return build_plant(scenario, Draw.of(scenario).departure)
+
+
 class Loop:
     """Plant, bridge and autopilot of one run, tick by tick."""
 
-    def __init__(self, scenario: DockScenario, start_ns: int, build_plant: BuildPlant = basilisk):
-        self._scenario, self._start_ns = scenario, start_ns
+    def __init__(self, scenario: DockScenario, start_ns: int, plant: Plant):
+        self._scenario, self._start_ns, self._plant = scenario, start_ns, plant
         draw = self._draw = Draw.of(scenario)
         self._rng = np.random.default_rng((scenario.seed, 2))
-        self._plant = build_plant(scenario, draw.departure)
         self.tick_ns = round(NS_PER_S / scenario.camera.rate_hz)
         self._ticks = 0
         self.delta_v_m_s = 0.0
@@ -228,8 +232,9 @@ class DockSource(Source):
 
         In real time the flight begins now, and who draws the envelopes waits until each is due.
         """
+        eye, plant = ScriptedEye(self.scenario), depart(self.scenario, self._build_plant)
         start_ns = time.time_ns() if self.live else START_NS
-        loop, eye = Loop(self.scenario, start_ns, self._build_plant), ScriptedEye(self.scenario)
+        loop = Loop(self.scenario, start_ns, plant)
         yield self._wrap(self.calibration, 0, start_ns)
         sequence = -1
         while True:
@@ -292,7 +297,7 @@ class ScriptedEye:
 
 def fly_on_truth(scenario: DockScenario, build_plant: BuildPlant = basilisk) -> list[tuple[Truth, Guidance]]:
     """Return the same flight with the truth for a state, a frame late like any, and no picture lost or blinded."""
-    loop, ticks = Loop(scenario, START_NS, build_plant), []
+    loop, ticks = Loop(scenario, START_NS, depart(scenario, build_plant)), []
     late: RelativeState | None = None
     while True:
         truth = loop.look()

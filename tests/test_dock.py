@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.bridge import NavigationBridge
 from pipeline.convert import NS_PER_S
-from pipeline.dock import START_NS, DockSource, Loop, fly_on_truth
+from pipeline.dock import START_NS, DockSource, Loop, depart, fly_on_truth
 from pipeline.dock_report import Docking, judge
 from pipeline.dock_scenario import BlindSection, DockScenario, FaultSection, StartSection
 from pipeline.replay import replay_direct
@@ -34,7 +34,7 @@ def honest(truth: Truth) -> RelativeState:
 
 def fly(scenario: DockScenario, distort: Distort = lambda axial_m, state: state) -> list[tuple[Truth, Guidance]]:
     """Fly a scenario on states that ``distort`` makes of honest ones, knowing how far the ports are apart."""
-    loop, ticks, axial_m = Loop(scenario, START_NS, FakePlant), [], scenario.start.axial_m
+    loop, ticks, axial_m = Loop(scenario, START_NS, depart(scenario, FakePlant)), [], scenario.start.axial_m
     while True:
         truth = loop.look()
         state = distort(axial_m, honest(truth))
@@ -140,7 +140,7 @@ def test_a_jump_of_the_state_is_refused():
 
 def test_stale_states_are_not_fresh():
     """States of one instant again and again are one measurement, and it grows old."""
-    loop = Loop(SHORT, START_NS, FakePlant)
+    loop = Loop(SHORT, START_NS, depart(SHORT, FakePlant))
     first = honest(loop.look())
     for _ in range(30):
         loop.bridge.take_state(first)
@@ -151,7 +151,7 @@ def test_stale_states_are_not_fresh():
 
 def test_the_bridge_never_hands_out_zeros():
     """Before any state it reckons with what it was told at the start, and says so."""
-    loop = Loop(SHORT, START_NS, FakePlant)
+    loop = Loop(SHORT, START_NS, depart(SHORT, FakePlant))
     loop.look()
     navigation = loop.bridge.navigation(loop.t_ns)
     assert isinstance(loop.bridge, NavigationBridge)
