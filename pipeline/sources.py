@@ -11,6 +11,7 @@ import re
 from pathlib import Path
 
 from pipeline.camera_device import OpenCvDevice
+from pipeline.mission import Mission
 from pipeline.picture_sources import IMAGE_SUFFIXES, CameraSource, FolderSource, VideoSource
 from pipeline.recording import MAGIC
 from pipeline.recording_source import RecordingSource
@@ -63,8 +64,11 @@ def open_source(
 def _simulated_camera(scenario: Path | None, options: SourceOptions) -> Source:
     from pipeline.sim_source import SimScenario, SimSource
 
-    options.refuse("the scenario of a simulated camera holds it", camera=options.camera, mission=options.mission)
-    return SimSource(SimScenario() if scenario is None else SimScenario.load(scenario), fps=options.fps)
+    options.refuse("the scenario of a simulated camera holds it", camera=options.camera)
+    seen = SimScenario() if scenario is None else SimScenario.load(scenario)
+    if options.mission is not None:
+        seen = SimScenario.model_validate({**dict(seen), "mission": Mission.load(options.mission)})
+    return SimSource(seen, fps=options.fps)
 
 
 def _docking(scenario: Path | None, options: SourceOptions) -> Source:

@@ -1,6 +1,8 @@
 """Basilisk's plant against the linear theory of relative motion and of rigid bodies, and a docking flown on it."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,6 @@ import pytest
 pytest.importorskip("Basilisk", reason="Basilisk is not installed: uv sync --extra dock")
 
 from astratag.transforms import exp_so3, inverse, rotation_from_wxyz
-from nodes.cli import main
 from pipeline.basilisk_plant import BasiliskPlant
 from pipeline.convert import NS_PER_S
 from pipeline.dock import DockSource, fly_on_truth
@@ -123,6 +124,7 @@ def test_over_the_bus_and_in_one_process_a_docking_is_the_same(tmp_path: Path):
     path = tmp_path / "near.json"
     path.write_text(scenario.to_json())
     for name, flags in (("bus", []), ("direct", ["--direct"])):
-        assert main(["dock", str(path), "--view", "none", "--out", str(tmp_path / name), *flags]) == 0
+        command = [sys.executable, "-m", "nodes", "dock", str(path), "--view", "none", "--out", str(tmp_path / name)]
+        subprocess.run([*command, *flags], cwd=Path(__file__).parents[1], check=True, capture_output=True)
         assert json.loads((tmp_path / name / "docking.json").read_text())["docked"]
     assert differences(tmp_path / "bus" / "run.mcap", tmp_path / "direct" / "run.mcap") == []
