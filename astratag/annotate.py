@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from astratag import checks
 from astratag.camera import Camera
 from astratag.detection import Detection
 from astratag.transforms import transform
@@ -37,10 +38,20 @@ def annotate(
     Measured layers in colour, the outer square in red where it is predicted, a dot on the marker's own
     top-left corner, the print's grid on curved surfaces, and identity, correlation and method in words.  With
     ``camera`` and ``side_m`` the marker's axes too, half a side long.
+    Raises ValueError for another kind of image, a camera of another size, or a side that is no length.
     """
+    image = checks.picture(image)
+    if side_m is not None:
+        checks.positive(side_m, "side_m")
+    if camera is not None:
+        checks.instance(camera, Camera, "camera", "Camera.load(path) reads one")
+        camera.require_size(image.shape[1], image.shape[0])
     picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image.copy()
     thickness = max(1, round(picture.shape[1] / 900))
+    if not isinstance(detections, Iterable):
+        raise ValueError(f"detections must be a list of Detection, got {detections!r}")
     for seen in detections:
+        checks.instance(seen, Detection, "detections", "Detector.detect finds them")
         if seen.warp_grid_px is not None:
             for line in (*seen.warp_grid_px, *seen.warp_grid_px.swapaxes(0, 1)):
                 _line(picture, line, GRID_BGR, 1, closed=False)

@@ -1,7 +1,7 @@
 """Artwork: a marker as closed outlines of ink, as a sheet to print at exact physical size, and as the published raster.
 
-The print follows the metric model of ``geometry``: black squares and frames at the edges of ``LAYERS``, cells at
-their polygons moved by ``DRAWN_OFFSET``.  A sheet adds crop marks around the quiet margin and, below it, a scale
+The print follows a ``Template`` of ``geometry``: black squares and frames at the edges of its layers, cells at its
+polygons.  A sheet adds crop marks around the quiet margin and, below it, a scale
 bar and a label.  Sheet coordinates: millimetres from the sheet's top-left corner, x right, y down.
 """
 
@@ -17,14 +17,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from astratag.checks import file_path, instance, numbers, positive
 from astratag.dictionary import Dictionary
 from astratag.geometry import (
     CELLS,
-    DRAWN_OFFSET,
     LAYERS,
+    PUBLISHED,
+    PUBLISHED_GEOMETRY,
     QUIET_MARGIN,
     TEMPLATE_UNITS,
     Layer,
+    MarkerGeometry,
+    Template,
     cell_polygons,
     layer_points,
     square,
@@ -73,17 +77,16 @@ def artwork_image(signature: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return image
 
 
-def ink_outlines(signature: NDArray[np.uint8]) -> list[Array]:
+def ink_outlines(signature: NDArray[np.uint8], template: Template = PUBLISHED) -> list[Array]:
     """Return the closed outlines (N, 2) between ink and white of a code (48,), template units.
 
     To be filled as one path: each crossing changes colour (even-odd), and outlines around ink run clockwise on
     the print and those around white the other way (non-zero works too).  White cells that touch are one outline,
     so no seam can show between them.
     """
-    white = cell_polygons()[_checked(signature).astype(bool)]
-    cells = [outline + DRAWN_OFFSET for outline in _union(white)]
+    cells = _union(template.cells[_checked(signature).astype(bool)])
     outlines = []
-    for layer in LAYERS:
+    for layer in template.layers:
         if layer.frame is not None:
             outlines.append(_frame_outline(layer)[::-1])
         outlines.append(square(*layer.black))
@@ -92,23 +95,30 @@ def ink_outlines(signature: NDArray[np.uint8]) -> list[Array]:
 
 
 def write_artwork(
-    dictionary: Dictionary, marker_id: int, path: str | Path, *, side_m: float, dpi: float = 300.0
+    dictionary: Dictionary,
+    marker_id: int,
+    path: str | Path,
+    *,
+    side_m: float,
+    dpi: float = 300.0,
+    geometry: MarkerGeometry = PUBLISHED_GEOMETRY,
 ) -> Path:
     """Write the sheet of a marker whose black square has sides of ``side_m`` metres, and return its path.
 
     The suffix of ``path`` says the format: .svg and .pdf are exact; .png has at least ``dpi`` dots an inch, raised
-    so that a template unit is an even number of pixels (its physical size is in its pHYs chunk).
+    so that a template unit is an even number of pixels (its physical size is in its pHYs chunk).  ``geometry`` other
+    than the published one is named on the sheet: the detector reads the published one.
     Raises ValueError for an unknown id or format, or a side or resolution that is not possible.
     """
-    path = Path(path)
+    instance(dictionary, Dictionary, "dictionary", "load_dictionary(name) makes one")
+    path = file_path(path)
     format_ = path.suffix.lower().removeprefix(".")
     if format_ not in FORMATS:
         raise ValueError(f"artwork format must be one of {', '.join(FORMATS)}, got {format_ or 'no suffix'!r} ({path})")
-    if not (np.isfinite(side_m) and side_m > 0):
-        raise ValueError(f"side_m must be positive and finite, got {side_m}: it is the black square's side in metres")
-    if not (np.isfinite(dpi) and dpi > 0):
-        raise ValueError(f"dpi must be positive and finite, got {dpi}")
-    sheet = _sheet(dictionary, marker_id, 1000.0 * side_m)
+    positive(side_m, "side_m", "length in metres, the black square's side")
+    positive(dpi, "dpi", "number of dots an inch")
+    instance(geometry, MarkerGeometry, "geometry", "MarkerGeometry(contraction, border, layers) makes one")
+    sheet = _sheet(dictionary, marker_id, 1000.0 * side_m, geometry)
     path.parent.mkdir(parents=True, exist_ok=True)
     if format_ == "svg":
         path.write_text(_svg(sheet), encoding="utf-8")
@@ -137,16 +147,18 @@ class _Sheet:
         return self.units[0] * self.unit_mm, self.units[1] * self.unit_mm
 
 
-def _sheet(dictionary: Dictionary, marker_id: int, side_mm: float) -> _Sheet:
+def _sheet(dictionary: Dictionary, marker_id: int, side_mm: float, geometry: MarkerGeometry) -> _Sheet:
     signature = dictionary.signature(marker_id)
     label = f"{dictionary.family}, id {marker_id}, side {side_mm:.6g} mm"
+    if geometry != PUBLISHED_GEOMETRY:
+        label += f", contraction {geometry.contraction:.4g}, border {geometry.border:.4g}, layers {geometry.layers}"
     unit = side_mm / TEMPLATE_UNITS
     margin = round(QUIET_MARGIN * TEMPLATE_UNITS)
     border, strip = int(np.ceil(CROP_MM / unit)), int(np.ceil(LABEL_MM / unit))
     cut = int(TEMPLATE_UNITS) + 2 * margin
     extra = max(0, int(np.ceil((0.65 * FONT_MM * len(label) / unit - cut) / 2)))  # 0.65 em: a generous character
     left, top = border + extra, border
-    ink = [(outline + (left + margin, top + margin)) * unit for outline in ink_outlines(signature)]
+    ink = [(outline + (left + margin, top + margin)) * unit for outline in ink_outlines(signature, geometry.template())]
     ink += _crop_marks(left * unit, top * unit, cut * unit)
 
     bar = _scale_bar_mm(cut * unit)
@@ -269,7 +281,7 @@ def _write_png(sheet: _Sheet, path: Path, dpi: float) -> None:
 
 
 def _checked(signature: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    signature = np.asarray(signature)
-    if signature.shape != (CELLS,):
-        raise ValueError(f"signature must hold {CELLS} cells, got shape {signature.shape}")
-    return signature
+    cells = numbers(signature, "signature")
+    if cells.shape != (CELLS,) or not np.isin(cells, (0, 1)).all():
+        raise ValueError(f"signature must hold {CELLS} cells, each 0 or 1, got shape {cells.shape}")
+    return cells.astype(np.uint8)

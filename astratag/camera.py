@@ -15,8 +15,15 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike, NDArray
 
+from astratag.checks import file_path, numbers, whole
+
 Array = NDArray[np.float64]
 DISTORTION_TERMS = 5
+LEAST_FOCAL = 0.02
+"""Focal length, as a fraction of the image, below which K is in another unit: a pinhole would see 175 degrees."""
+LARGEST_PX = 1e9
+"""What is more in K is damaged."""
+_IMAGE_AXES = np.eye(2)[:, :, None]
 SKEW_ALLOWED = 1e-6
 """Skew, as a fraction of the focal length, that is rounding left by a calibration program."""
 PRINCIPAL_POINT_SLACK = 0.15
@@ -31,30 +38,37 @@ class Camera:
     distortion: Array = field(default_factory=lambda: np.zeros(DISTORTION_TERMS))
     width: int = 0
     height: int = 0
+    _pinhole: tuple[float, float, float, float] = field(init=False, repr=False)
+    """K's numbers: fx, fy, cx, cy."""
+    _terms: tuple[float, ...] | None = field(init=False, repr=False)
+    """The distortion's numbers, None when there is none."""
 
     def __init__(self, K: ArrayLike, distortion: ArrayLike = (0.0,) * DISTORTION_TERMS, *, width: int, height: int):
-        K, distortion = np.array(K, dtype=float), np.array(distortion, dtype=float).ravel()
-        if not np.isfinite(K).all():
-            raise ValueError(f"K must be finite, got {K.tolist()}")
+        K, distortion = numbers(K, "K"), numbers(distortion, "distortion").ravel()
+        width, height = whole(width, "width", 1), whole(height, "height", 1)
         if K.shape != (3, 3) or not np.allclose(K[2], (0, 0, 1)):
             raise ValueError(f"K must be 3x3 with last row 0 0 1, got {K.tolist()}. Is it transposed?")
-        if K[0, 0] <= 0 or K[1, 1] <= 0:
-            raise ValueError(f"K must have positive focal lengths, got fx {K[0, 0]}, fy {K[1, 1]}")
+        if min(K[0, 0] / width, K[1, 1] / height) < LEAST_FOCAL or np.abs(K).max() > LARGEST_PX:
+            raise ValueError(
+                f"K must have positive focal lengths in pixels, got fx {K[0, 0]:g}, fy {K[1, 1]:g} about "
+                f"({K[0, 2]:g}, {K[1, 2]:g}). Are they in millimetres?"
+            )
         if max(abs(K[0, 1]), abs(K[1, 0])) > SKEW_ALLOWED * K[0, 0]:
             raise ValueError(
                 f"K must have no skew, got {K[0, 1]} and {K[1, 0]} off the diagonal: the model is OpenCV's"
             )
         K[0, 1] = K[1, 0] = 0.0
-        if distortion.size not in (0, 4, DISTORTION_TERMS) or not np.isfinite(distortion).all():
+        if distortion.size not in (0, 4, DISTORTION_TERMS):
             raise ValueError(
-                f"distortion must be 5 finite terms (k1, k2, p1, p2, k3), got {distortion.size}: "
+                f"distortion must be 5 terms (k1, k2, p1, p2, k3), got {distortion.size}: "
                 "fisheye and rational models are not supported"
             )
-        if int(width) <= 0 or int(height) <= 0:
-            raise ValueError(f"width and height must be positive pixels, got {width}x{height}")
         padded = np.zeros(DISTORTION_TERMS)
         padded[: distortion.size] = distortion
-        for name, value in (("K", K), ("distortion", padded), ("width", int(width)), ("height", int(height))):
+        focal_and_centre = (K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item())
+        terms = tuple(padded.tolist()) if padded.any() else None
+        fields = {"K": K, "distortion": padded, "width": width, "height": height}
+        for name, value in (*fields.items(), ("_pinhole", focal_and_centre), ("_terms", terms)):
             object.__setattr__(self, name, value)
 
     @classmethod
@@ -69,11 +83,14 @@ class Camera:
         without images to compare the size is twice the principal point.
         Raises ValueError with what is missing or wrong.
         """
-        path = Path(path)
+        for pixels, name in ((width, "width"), (height, "height")):
+            if pixels is not None:
+                whole(pixels, name, 1)
+        path = file_path(path)
         try:
             text = path.read_text()
             data: Any = json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)
-        except (OSError, UnicodeDecodeError, json.JSONDecodeError, yaml.YAMLError) as error:
+        except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
             raise ValueError(f"cannot read camera file {path}: {' '.join(str(error).split())}") from error
         try:
             K = _numbers(data["camera_matrix"]).reshape(3, 3)
@@ -84,7 +101,7 @@ class Camera:
             raise ValueError(f"camera file {path} has no readable camera_matrix and distortion_coefficients") from error
         if model not in ("plumb_bob", ""):
             raise ValueError(f"camera file {path}: distortion model {model!r} is not supported, only plumb_bob")
-        if not all(size):
+        if not all(size) and np.isfinite(K).all():
             size = _size_from_principal_point(K, width, height)
         try:
             camera = cls(K, distortion, width=size[0], height=size[1])
@@ -99,6 +116,7 @@ class Camera:
 
     def scaled(self, width: int, height: int) -> Camera:
         """Return this camera for the same picture resized to width x height pixels."""
+        width, height = whole(width, "width", 1), whole(height, "height", 1)
         sx, sy = width / self.width, height / self.height
         K = self.K.copy()
         K[0] *= sx
@@ -118,41 +136,39 @@ class Camera:
         """Return pixels (N, 2) of points (N, 3) in the camera frame, which must lie in front of it (z > 0)."""
         X, Y, Z = np.asarray(points_cam, dtype=float).reshape(-1, 3).T
         x, y = X / Z, Y / Z
-        if self.distortion.any():
-            k1, k2, p1, p2, k3 = self.distortion.tolist()
+        if self._terms is not None:
+            k1, k2, p1, p2, k3 = self._terms
             xx, yy, xy2 = x * x, y * y, 2 * x * y
             rr = xx + yy
             radial = 1 + rr * (k1 + rr * (k2 + rr * k3))
             x, y = x * radial + p1 * xy2 + p2 * (rr + 2 * xx), y * radial + p1 * (rr + 2 * yy) + p2 * xy2
-        (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
+        fx, fy, cx, cy = self._pinhole
         at = np.empty((2, len(x)))
         at[0], at[1] = fx * x + cx, fy * y + cy
         return at.T
 
     def projection_jacobian(self, points_cam: Array) -> Array:
         """Return d pixel / d point (N, 2, 3), px per metre, at points (N, 3) in the camera frame (z > 0)."""
-        X, Y, Z = np.asarray(points_cam, dtype=float).reshape(-1, 3).T
+        points = np.asarray(points_cam, dtype=float).reshape(-1, 3).T
+        return np.stack([self.projection_slopes(points, axis) for axis in _IMAGE_AXES]).transpose(2, 0, 1)
+
+    def projection_slopes(self, points_cam: Array, along: Array) -> Array:
+        """Return d pixel / d point along image vectors (2, N): (3, N), px per metre, at points (3, N) with z > 0."""
+        X, Y, Z = points_cam
         inverse_z = 1 / np.maximum(Z, 1e-9)
         x, y = X * inverse_z, Y * inverse_z
-        (fx, _, _), (_, fy, _), _ = self.K.tolist()
-        J = np.zeros((2, 3, len(X)))
-        if self.distortion.any():  # Brown, "Close-range camera calibration", 1971, differentiated
-            k1, k2, p1, p2, k3 = self.distortion.tolist()
+        fx, fy, _, _ = self._pinhole
+        a, b = along[0] * (fx * inverse_z), along[1] * (fy * inverse_z)
+        if self._terms is not None:  # Brown, "Close-range camera calibration", 1971, differentiated
+            k1, k2, p1, p2, k3 = self._terms
             rr = x * x + y * y
             radial = 1 + rr * (k1 + rr * (k2 + rr * k3))
             slope = 2 * (k1 + rr * (2 * k2 + rr * (3 * k3)))  # d radial / d r, over r
             mixed = x * y * slope + 2 * (p1 * x + p2 * y)
-            J[0, 0] = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
-            J[0, 1] = J[1, 0] = mixed
-            J[1, 1] = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
-            J[:, 2] = -(J[:, 0] * x + J[:, 1] * y)
-        else:
-            J[0, 0] = J[1, 1] = 1.0
-            J[0, 2], J[1, 2] = -x, -y
-        J *= inverse_z
-        J[0] *= fx
-        J[1] *= fy
-        return J.transpose(2, 0, 1)
+            by_x = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
+            by_y = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
+            a, b = a * by_x + b * mixed, a * mixed + b * by_y
+        return np.stack([a, b, -(a * x + b * y)])
 
     def undistort(self, points_px: Array) -> Array:
         """Return where pixels (N, 2) would be without distortion, in normalised coordinates x/z, y/z (N, 2)."""

@@ -8,42 +8,45 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astratag.align import COARSE_BLUR, COARSE_STEPS, FINE_STEPS, align
-from astratag.geometry import TEMPLATE_UNITS, square
+from astratag.geometry import LAYERS, TEMPLATE_UNITS, square
+from astratag.relight import RELIT_SAMPLES, relit_cells
 from astratag.search import BentQuads
 from astratag.signature import (
-    ACCEPT_OF_MANY_WARPS,
+    LEAST_SEEN,
     SAMPLES,
     Artwork,
     Codebook,
     Reading,
-    Warp,
     blur_level,
     cell_values,
     sample,
 )
 from astratag.tps import KNOTS, ThinPlate
-from astratag.warp import BentWarp, HomographyWarp
+from astratag.warp import BentWarp, FittedWarp, HomographyWarp
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-PROMISING = 0.5
-"""Correlation through a rough quad from which a candidate is worth fitting."""
-PROMISING_SMALL = 0.6
-"""The same of a square so small that its code is blurred: blurred codes are more alike, and like more."""
+MORE_OF_SMALL = 0.1
+"""How much better a square must read that is so small that its code is blurred: blurred codes are like more."""
 MAX_CANDIDATES = 10
-HOPELESS = 0.5
-"""Correlation after a coarse alignment below which a fine one is not tried."""
+LEAST_LIKENESS = 0.45
+"""Correlation of a layer, as printed, with what is seen below which it is something else."""
 SURE = 0.85
 """Correlation from which a reading needs no second opinion."""
-PROMISING_BENT = 0.55
-"""Correlation through the best of some forty shifts from which a bent square is worth aligning."""
+MORE_OF_BENT = 0.05
+"""How much better a bent square must read: through the best of some forty shifts."""
+MAX_RELIT, MAX_RELIT_READ = 4, 40
+LEAST_RELIT_SIDE_PX = 32.0
+"""Of squares smaller than this the margin and the gaps between cells are too thin to tell how they are lit."""
 MAX_BENT = 3
-MAX_BENT_READ = 16
+MAX_BENT_READ = 8
 LEAST_BENT_SIDE_PX = 16.0
+LEAST_FRAMED, LEAST_FRAMED_RELIT = 3, 2
 LEAST_STEP_GREY = 4.0
 """How much brighter the surroundings of a square must be than its border, on average."""
 OUTER = square(0.0, TEMPLATE_UNITS)
+OUTER.flags.writeable = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,14 +54,15 @@ class Candidate:
     """A square that may be a layer of a marker: what it reads, and its corners (4, 2) in the marker's order.
 
     ``warp`` is what it was read through, taking the whole template onto the square.  ``aligned`` says that it was
-    moved until the square looks as it reads.
+    moved until the square looks as it reads; ``relit`` that its light is so uneven that it is read cell by cell.
     """
 
     reading: Reading
     corners_px: Array
-    warp: Warp
+    warp: FittedWarp
     bent: bool = False
     aligned: bool = False
+    relit: bool = False
 
     @property
     def side_px(self) -> float:
@@ -79,17 +83,38 @@ def flat_candidates(gray: Image, quads: Array, codebook: Codebook) -> list[Candi
         return []
     sides_px = looks_large(quads)
     readings = codebook.read(cell_values(gray, points_in(quads, SAMPLES)), sides_px)
-    least = np.where(blur_level(sides_px) > 0, PROMISING_SMALL, PROMISING)
+    least = codebook.promising() + MORE_OF_SMALL * (blur_level(sides_px) > 0)
     promising = [pair for *pair, bar in zip(readings, quads, least, strict=True) if pair[0].correlation >= bar]
     return [_turned(*pair) for pair in sorted(promising, key=lambda pair: -pair[0].correlation)[:MAX_CANDIDATES]]
 
 
-def framed(gray: Image, quads: Array) -> Array:
-    """Return those of quads (Q, 4, 2) that are darker inside their edges than outside, on at least three sides."""
+def relit_candidates(gray: Image, light: NDArray[np.float32], quads: Array, codebook: Codebook) -> list[Candidate]:
+    """Return the quads (Q, 4, 2) that read as a code where shadows, glare and coverings leave it, the best first.
+
+    So many cells are given up, and any code is so much like an uneven light, that a rough quad must read better.
+    """
+    quads = framed(gray, quads[looks_large(quads) >= LEAST_RELIT_SIDE_PX], LEAST_FRAMED_RELIT)[:MAX_RELIT_READ]
     if len(quads) == 0:
-        return quads
-    values = sample(gray, points_in(quads, _FRAME)).reshape(len(quads), 2, 4, -1).mean(axis=3)
-    return quads[(values[:, 0] - values[:, 1] >= LEAST_STEP_GREY).sum(axis=1) >= 3]
+        return []
+    readings = codebook.read_seen(*relit_cells(light, points_in(quads, RELIT_SAMPLES)))
+    promising = [
+        (reading, quad)
+        for reading, quad in zip(readings, quads, strict=True)
+        if reading.cells >= LEAST_SEEN and reading.correlation >= codebook.promising(reading.cells)
+    ]
+    best = sorted(promising, key=lambda pair: -pair[0].correlation)[:MAX_RELIT]
+    return [replace(_turned(*pair), relit=True) for pair in best]
+
+
+def framed(gray: Image, quads: Array, least: int = LEAST_FRAMED) -> Array:
+    """Return those of quads (Q, 4, 2) that are darker inside their edges than outside, on at least so many sides."""
+    return quads[darker_inside(sample(gray, points_in(quads, FRAME)), least)] if len(quads) else quads
+
+
+def darker_inside(values: Array, least: int = LEAST_FRAMED) -> NDArray[np.bool_]:
+    """Return which squares are darker inside than outside on so many sides, from gray values (Q, F) at ``FRAME``."""
+    outside, inside = values.reshape(len(values), 2, 4, -1).mean(axis=3).swapaxes(0, 1)
+    return (outside - inside >= LEAST_STEP_GREY).sum(axis=1) >= least
 
 
 def _frame_points() -> Array:
@@ -101,7 +126,7 @@ def _frame_points() -> Array:
     return np.stack(sides, axis=1).reshape(-1, 2) * TEMPLATE_UNITS
 
 
-_FRAME = _frame_points()
+FRAME = _frame_points()
 
 
 def points_in(quads: Array, template: Array) -> NDArray[np.float32]:
@@ -145,6 +170,8 @@ def _profiles(template: Array) -> tuple[Array, Array, Array]:
 
 
 _SHIFTS = np.array([(a, b) for a in TANGENTIAL for b in TANGENTIAL if abs(a) + abs(b) < 0.34])
+MANY_WARPS = len(LAYERS) * (len(_SHIFTS) + 1)
+"""How many warps a candidate is read through at most: flat, and bent in all ways, as any layer."""
 
 
 def bent_candidates(gray: Image, quads: BentQuads, codebook: Codebook) -> list[Candidate]:
@@ -162,10 +189,9 @@ def bent_candidates(gray: Image, quads: BentQuads, codebook: Codebook) -> list[C
 
 def _framed_bent(gray: Image, shapes: BentQuads) -> NDArray[np.bool_]:
     """Return which shapes are darker inside their bulging edges than outside, on at least three sides."""
-    shares = np.maximum(_profiles(_FRAME)[0], 0.0)
-    at = points_in(shapes.corners_px, _FRAME) + shares @ shapes.bulges_px
-    values = sample(gray, at).reshape(len(at), 2, 4, -1).mean(axis=3)
-    return (values[:, 0] - values[:, 1] >= LEAST_STEP_GREY).sum(axis=1) >= 3
+    shares = np.maximum(_profiles(FRAME)[0], 0.0)
+    at = points_in(shapes.corners_px, FRAME) + shares @ shapes.bulges_px
+    return darker_inside(sample(gray, at))
 
 
 def _bent(gray: Image, corners_px: Array, bulges_px: Array, codebook: Codebook) -> Candidate | None:
@@ -178,7 +204,7 @@ def _bent(gray: Image, corners_px: Array, bulges_px: Array, codebook: Codebook) 
     places = base + along
     readings = codebook.read(cell_values(gray, (_SPLINE @ places).astype(np.float32)))
     best = max(range(len(readings)), key=lambda i: readings[i].correlation)
-    if readings[best].correlation < PROMISING_BENT:
+    if readings[best].correlation < codebook.promising() + MORE_OF_BENT:
         return None
     turns = readings[best].quarter_turns
     order = np.roll(np.arange(len(KNOTS)).reshape(-1, 4), -turns, axis=1).ravel()  # knots come in fours, like corners
@@ -193,14 +219,15 @@ _SPLINE = ThinPlate(KNOTS).basis(SAMPLES)
 def aligned(gray: Image, candidate: Candidate, codebook: Codebook, artwork: Artwork) -> Candidate | None:
     """Return a candidate moved until it looks as it reads, None when it then does not read as that surely."""
     marker_id, side_px = candidate.reading.marker_id, candidate.side_px
-    layer = int(artwork.layer_scores(gray, candidate.warp, marker_id, side_px).argmax())
-    expected = artwork.expected(marker_id, side_px)[layer]
+    scores = artwork.layer_scores(gray, candidate.warp, marker_id, side_px)
+    if scores.max() < LEAST_LIKENESS:
+        return None
+    expected = artwork.expected(marker_id, side_px)[scores.argmax()]
     warp = candidate.warp
-    assert isinstance(warp, HomographyWarp | BentWarp)
     reading = candidate.reading
-    for blur, steps, least in ((COARSE_BLUR, COARSE_STEPS, HOPELESS), (0.0, FINE_STEPS, ACCEPT_OF_MANY_WARPS)):
+    for blur, steps in ((COARSE_BLUR, COARSE_STEPS), (0.0, FINE_STEPS)):
         warp = align(gray, warp, artwork.points, expected, blur=blur, steps=steps)
         reading = codebook.read_as(cell_values(gray, warp(SAMPLES)[None])[0], marker_id, side_px)
-        if reading.correlation < least:
+        if reading.correlation < codebook.promising():
             return None
     return replace(candidate, reading=reading, corners_px=warp(OUTER), warp=warp, aligned=True)

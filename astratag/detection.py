@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from astratag.geometry import CELLS
+from astratag.surface import Surface
+
 Array = NDArray[np.float64]
 
 
@@ -25,20 +28,26 @@ class LayerDetection:
 
 @dataclass(frozen=True, eq=False)
 class PlanarPose:
-    """One of the two poses that explain a planar marker."""
+    """One of the two poses that explain a planar marker.
+
+    ``probability`` is how likely it is of the two, given the corners and their standard deviations, when neither was
+    likelier beforehand.
+    """
 
     T_cam_marker: Array
     reprojection_rms_px: float
+    probability: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Detection:
     """One marker in one image.
 
-    ``corners_px`` (4, 2) is the outer black square in the marker's order, predicted when only inner layers
-    are seen.  ``T_cam_marker`` (4, 4) is the refined pose on the marker's declared surface with its
-    ``covariance`` (6, 6) (metres then radians, right perturbation in marker axes); both None without a
-    camera.  ``warp_grid_px`` (n, n, 2) is the print's regular grid as it lies in the image, on curved surfaces.
+    ``corners_px`` (4, 2) is the outer black square in the marker's order: as the pose fitted to all edges has it when
+    the surface is declared, else as its own edges have it, or predicted when only inner layers are seen.
+    ``T_cam_marker`` (4, 4) is the refined pose on the marker's declared surface with its ``covariance`` (6, 6) (metres
+    then radians, right perturbation in marker axes); both None without a camera.  ``warp_grid_px`` (n, n, 2) is the
+    print's regular grid as it lies in the image, on curved surfaces.
     """
 
     family: str
@@ -54,3 +63,7 @@ class Detection:
     covariance: Array | None = None
     reprojection_rms_px: float | None = None
     warp_grid_px: Array | None = None
+    cells: int = CELLS
+    """How many cells ``correlation`` is worth: fewer when some are hidden, or the print looks blurred."""
+    surface: Surface | None = None
+    """The curved surface ``T_cam_marker`` is on: as declared, or estimated from this image where it was not."""

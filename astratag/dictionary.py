@@ -9,14 +9,16 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from operator import index
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from astratag.checks import file_path, instance, numbers, positive
 from astratag.codes.algebraic import Rejected
 from astratag.codes.families import FAMILIES
 from astratag.codes.family import Family
-from astratag.codes.soft import Reading, Search, decide, kept_cells
+from astratag.codes.soft import Reading, Search, checked_cells, decide, kept_cells
 from astratag.codes.words import pack
 from astratag.geometry import CELLS, square, turn_clockwise
 
@@ -24,6 +26,8 @@ ORIENTATIONS = ("0", "90", "180", "270")
 """Names of the four readings: "90" is what the print reads when turned clockwise by 90 degrees."""
 
 PUBLISHED = "astratag20"
+LARGEST_ID = (1 << 31) - 1
+"""What fits wherever an id is written."""
 LARGEST = 1 << 16
 """Most identities a dictionary may hold: each is compared with everything seen."""
 
@@ -58,16 +62,20 @@ class Dictionary:
     signatures: NDArray[np.uint8] = field(repr=False)
 
     def __post_init__(self) -> None:
-        if not self.ids:
+        instance(self.family, str, "family", "it is a name")
+        ids = _integers(self.ids)
+        if not ids:
             raise ValueError(f"dictionary {self.family!r} holds no markers")
-        if not np.isin(self.signatures, (0, 1)).all():
+        if not 0 <= min(ids) <= max(ids) <= LARGEST_ID:
+            raise ValueError(f"dictionary {self.family!r} has ids {min(ids)}-{max(ids)}, outside of 0-{LARGEST_ID}")
+        cells = numbers(self.signatures, "signatures")
+        if not np.isin(cells, (0, 1)).all():
             raise ValueError(f"dictionary {self.family!r} has cells that are neither 0 nor 1")
-        if self.signatures.shape != (len(self.ids), CELLS):
-            raise ValueError(
-                f"signatures must be ({len(self.ids)}, {CELLS}), got {self.signatures.shape}: one row of cells an id"
-            )
-        signatures = np.array(self.signatures, dtype=np.uint8)
+        if cells.shape != (len(ids), CELLS):
+            raise ValueError(f"signatures must be ({len(ids)}, {CELLS}), got {cells.shape}: one row of cells an id")
+        signatures = cells.astype(np.uint8)
         signatures.flags.writeable = False
+        object.__setattr__(self, "ids", ids)
         object.__setattr__(self, "signatures", signatures)
         if len(set(self.ids)) != len(self.ids):
             raise ValueError(f"dictionary {self.family!r} lists an id twice")
@@ -111,11 +119,12 @@ class Dictionary:
 
     def row(self, marker_id: int) -> int:
         """Return the row of an id.  Raises ValueError for an id that is not in the dictionary."""
-        if marker_id not in self._row:
+        try:
+            return self._row[index(marker_id)]
+        except (KeyError, TypeError):
             raise ValueError(
-                f"marker {marker_id} is not in dictionary {self.family!r} (ids {min(self.ids)}-{max(self.ids)})"
-            )
-        return self._row[marker_id]
+                f"marker {marker_id!r} is not in dictionary {self.family!r} (ids {min(self.ids)}-{max(self.ids)})"
+            ) from None
 
     def signature(self, marker_id: int) -> NDArray[np.uint8]:
         """Return the upright code (48,) of an id.  Raises ValueError for an id that is not in the dictionary."""
@@ -143,7 +152,7 @@ class Dictionary:
         Raises ValueError for cells or flags of another shape, or cells that are not finite.
         """
         search = Search(self._words.size, threshold, most_missing)
-        kept = kept_cells(cells, erased)
+        cells, kept = checked_cells(cells), kept_cells(erased)
         return decide(cells, kept, self._codes, lambda n: (self.ids[n // 4], n % 4), search)
 
 
@@ -155,8 +164,8 @@ def _published() -> Dictionary:
 def _from_json(path: Path) -> Dictionary:
     """Read the reference implementation's JSON: {id: {"0" | "90" | ...: {"signature": 48 characters}}}."""
     try:
-        entries = json.loads(path.read_text())
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        entries = json.loads(path.read_text(), object_pairs_hook=_each_once)
+    except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"cannot read dictionary {path}: {error}") from error
     try:
         ids = tuple(sorted(int(key) for key in entries))
@@ -179,6 +188,23 @@ def _from_json(path: Path) -> Dictionary:
     return dictionary
 
 
+def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the entries of a JSON object.  Raises ValueError for a key listed twice."""
+    entries = dict(pairs)
+    if len(entries) < len(pairs):
+        twice = next(key for n, (key, _) in enumerate(pairs) if key in dict(pairs[:n]))
+        raise ValueError(f"{twice!r} is listed twice")
+    return entries
+
+
+def _is_file(path: str) -> bool:
+    """Return whether a path names a file: not when it is too long to be one."""
+    try:
+        return Path(path).is_file()
+    except OSError:
+        return False
+
+
 def load_dictionary(name: str | Path = PUBLISHED, ids: Iterable[int] | None = None) -> Dictionary:
     """Return a dictionary by name, or from a file in the reference's JSON format, whole or only some ``ids`` of it.
 
@@ -187,7 +213,7 @@ def load_dictionary(name: str | Path = PUBLISHED, ids: Iterable[int] | None = No
     that are not there, or a whole family too large to look for.
     """
     source, colon, listed = str(name).rpartition(":")
-    if not colon or Path(name).is_file():
+    if not colon or _is_file(str(name)):
         source = str(name)
     elif ids is None:
         ids = _listed_ids(listed, str(name))
@@ -197,7 +223,7 @@ def load_dictionary(name: str | Path = PUBLISHED, ids: Iterable[int] | None = No
         return _of_family(FAMILIES[source], ids)
     if source == PUBLISHED:
         whole = _published()
-    elif Path(source).is_file():
+    elif _is_file(source):
         whole = _from_json(Path(source))
     else:
         known = ", ".join((PUBLISHED, *FAMILIES))
@@ -213,7 +239,7 @@ def _of_family(family: Family, ids: Iterable[int] | None) -> Dictionary:
             f"'{family.name}:0-99'"
         )
     chosen = tuple(range(len(family))) if ids is None else _integers(ids)
-    return Dictionary(family.name, chosen, family.signatures(np.array(chosen, dtype=np.int64)))
+    return Dictionary(family.name, chosen, family.signatures(chosen))
 
 
 def _integers(ids: Iterable[int]) -> tuple[int, ...]:
@@ -242,8 +268,8 @@ def write_dictionary(dictionary: Dictionary, path: str | Path, side_m: float = 0
     bottom-right and bottom-left corner: millimetres from the print's top-left corner, x right, y down, z 0.  The
     reference gives 30.0 for a side and no unit.  Raises ValueError for a side that is no length.
     """
-    if not (np.isfinite(side_m) and side_m > 0):
-        raise ValueError(f"side_m must be a positive length in metres, got {side_m}")
+    instance(dictionary, Dictionary, "dictionary", "load_dictionary(name) makes one")
+    positive(side_m, "side_m")
     corners_mm = np.zeros((4, 3))
     corners_mm[:, :2] = square(0.0, round(1e3 * side_m, 6))
     entries = {
@@ -256,6 +282,6 @@ def write_dictionary(dictionary: Dictionary, path: str | Path, side_m: float = 0
         }
         for row, marker_id in enumerate(dictionary.ids)
     }
-    path = Path(path)
+    path = file_path(path)
     path.write_text(json.dumps(entries, indent=2))
     return path

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from astratag.edges import EDGE_LAYER, EDGES
 from astratag.fit import EdgeFit, fit_edges
 from astratag.geometry import LAYERS, square
+from astratag.neighbours import Crossings
 from astratag.warp import BentWarp, FittedWarp, HomographyWarp
 
 Light = NDArray[np.float32]
@@ -34,39 +35,41 @@ def fit_own_edges(light: Light, warp: FittedWarp, layer: int) -> Fit | None:
     return fit_edges(light, warp, ALL_EDGES[layer == EDGE_LAYER], _search_px(warp, layer, 0.03))
 
 
-def grow(light: Light, warp: FittedWarp, layer: int) -> Fit | None:
+def grow(light: Light, warp: FittedWarp, layer: int, near: Crossings) -> Fit | None:
     """Return the fit to all edges in view, begun with a warp fitted to one layer.
 
-    On a surface that is not known the warp may bend as it grows, and stays flat if that explains the edges.
+    On a surface that is not known the warp may bend as it grows, and stays flat if that explains the edges, or if only
+    one layer is seen: its edges do not tell how the inside lies.
     """
     search_px = _search_px(warp, layer, 0.02)
-    flat = _grow_through(light, warp, layer, search_px)
+    flat = _grow_through(light, warp, layer, search_px, near)
     if not isinstance(warp, HomographyWarp):
         return flat
-    bent = _grow_through(light, BentWarp(warp, np.zeros((2, 3))), layer, search_px)
+    bent = _grow_through(light, BentWarp(warp, np.zeros((2, 3))), layer, search_px, near)
     if flat is None or bent is None:
         return flat or bent
-    return bent if bent.cost < CURVED_GAIN * flat.cost else flat
+    several = len(set(EDGE_LAYER[bent.points.edge[bent.weight.any(axis=1)]].tolist())) > 1
+    return bent if several and bent.cost < CURVED_GAIN * flat.cost else flat
 
 
-def _grow_through(light: Light, warp: FittedWarp, layer: int, search_px: float) -> Fit | None:
+def _grow_through(light: Light, warp: FittedWarp, layer: int, search_px: float, near: Crossings) -> Fit | None:
     """Return the settled fit after taking in the nearest layers, then all."""
-    near = ALL_EDGES[np.abs(EDGE_LAYER - layer) <= 1]
-    for edges in (near, ALL_EDGES) if layer > 0 else (ALL_EDGES,):
+    nearest = ALL_EDGES[np.abs(EDGE_LAYER - layer) <= 1]
+    for edges in (nearest, ALL_EDGES) if layer > 0 else (ALL_EDGES,):
         fit = fit_edges(light, warp, edges, search_px)
         if fit is None:
             return None
         warp = fit.warp
-    return settle(light, warp)
+    return settle(light, warp, near)
 
 
-def settle(light: Light, warp: FittedWarp) -> Fit | None:
+def settle(light: Light, warp: FittedWarp, near: Crossings) -> Fit | None:
     """Return the final fit to all edges from a warp that is right to a pixel or two.
 
-    A bend needs the inner squares even where their frames are thin: the outer edges do not fix the inside.
+    ``near`` is what lies beside the edges in the marker's print.
     """
     for _ in range(MAX_SETTLING):
-        fit = fit_edges(light, warp, ALL_EDGES, SETTLE_PX, sharp_only=not isinstance(warp, BentWarp))
+        fit = fit_edges(light, warp, ALL_EDGES, SETTLE_PX, near)
         if fit is None or fit.moved_px < SETTLED_PX:
             break
         warp = fit.warp

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astratag.codes import acceptance_threshold
+from astratag.codes.acceptance import FALSE_ACCEPT_RATE
 from astratag.geometry import LAYERS, TEMPLATE_UNITS, square
 from astratag.synthesis import Alignment, Synthesis
 from astratag.warp import HomographyWarp
@@ -47,22 +48,32 @@ class Match(NamedTuple):
     alignment: Alignment[HomographyWarp]
 
 
-def acceptance_of_pixels(readings: int) -> float:
-    """Return the correlation of the cells, aligned, that one chance square in a million exceeds."""
-    return acceptance_threshold(readings, cells=INDEPENDENT_CELLS)
+def acceptance_of_pixels(readings: int, false_accept_rate: float = FALSE_ACCEPT_RATE) -> float:
+    """Return the correlation of the cells, aligned, that chance squares exceed at a false-accept rate."""
+    return acceptance_threshold(readings, false_accept_rate=false_accept_rate, cells=INDEPENDENT_CELLS)
 
 
-def match(synthesis: Synthesis, light: Light, quad: Array, blur_px: float, accept: float) -> Match | None:
-    """Return the marker that a rough square (4, 2) is a layer of, None when it is none for sure.
+class Rough(NamedTuple):
+    """A rough square as if it were the outermost, and how its cells correlate (I, 4) with each identity, turned."""
+
+    warp: HomographyWarp
+    scores: Array
+
+
+def rough_matches(synthesis: Synthesis, light: Light, quads: Array, blur_px: float) -> list[Rough]:
+    """Return those of rough squares (Q, 4, 2) that are worth aligning, the best first."""
+    warps = [HomographyWarp.from_points(OUTER, quad) for quad in quads]
+    rough = [Rough(warp, synthesis.read(light, warp, blur_px)) for warp in warps if _side_px(warp) >= LEAST_SIDE_PX]
+    worth = [one for one in rough if one.scores.max() >= WORTH_ALIGNING]
+    return sorted(worth, key=lambda one: -float(one.scores.max()))
+
+
+def match(synthesis: Synthesis, light: Light, rough: Rough, blur_px: float, accept: float) -> Match | None:
+    """Return the marker that a rough square is a layer of, None when it is none for sure.
 
     ``accept`` is the correlation of the cells from which they are believed.
     """
-    warp = HomographyWarp.from_points(OUTER, quad)
-    if _side_px(warp) < LEAST_SIDE_PX:
-        return None
-    scores = synthesis.read(light, warp, blur_px)
-    if scores.max() < WORTH_ALIGNING:
-        return None
+    warp, scores = rough
     for _ in range(READINGS):
         row, turns = divmod(int(scores.argmax()), 4)
         marker_id = synthesis.ids[row]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -13,16 +14,20 @@ from astratag.camera import Camera
 from astratag.detection import LayerDetection, PlanarPose
 from astratag.geometry import LAYERS, square
 from astratag.surface import Surface
-from astratag.transforms import pose, transform
+from astratag.transforms import pose
 from astratag.warp import PoseWarp, on_surface
 
 Array = NDArray[np.float64]
 
 _SQUARES = [square(*layer.black) for layer in LAYERS]
-REFINEMENT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 1e-8)
+REFINEMENT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 6, 1e-8)
 MAX_STEPS = 30
 HOPELESS_RATIO, HOPELESS_RMS_PX = 10.0, 1.0
 """A planar pose that fits the corners worse than the better one by this factor, and than this, is not refined."""
+UNSEEN = 1e-12
+"""Information, as a fraction of the best, that is taken to be there where the corners do not fix the pose at all."""
+LEAST_SCALE = 1e-12
+"""Added to pixels per metre and per radian, so that none is zero."""
 CONVERGED_PX2 = 1e-9
 """Stop when the squared error, in sigmas, no longer falls by this fraction."""
 
@@ -66,44 +71,81 @@ def poses_from_square(
 
 
 def planar_poses(
-    camera: Camera, layers: Sequence[LayerDetection], side_m: float, surface: Surface
+    camera: Camera,
+    layers: Sequence[LayerDetection],
+    side_m: float,
+    surface: Surface,
+    known: Array | None = None,
 ) -> tuple[PlanarPose, ...]:
-    """Return both poses that explain the measured layers, refined on all their corners, the better first.
+    """Return both poses that explain the measured layers, refined on all their corners, the likelier first.
 
-    One that explains them far worse than the other is left as the largest layer alone has it.
+    ``known`` is a pose already fitted to more than the corners: it stands for the one it is near, and the other is
+    looked for from its mirror image.  One that explains the corners far worse than the other is not refined.
     """
     if not layers:
         return ()
-    largest = min(layers, key=lambda seen: seen.layer)
-    starts = poses_from_square(camera, _SQUARES[largest.layer], largest.corners_px, side_m, surface)
-    template, corners_px = np.concatenate([_SQUARES[seen.layer] for seen in layers]), _corners(layers)
-
-    points_marker = np.ascontiguousarray(on_surface(surface, side_m, template)[0].T)
-    rms_px = _reprojection_rms(camera, starts, points_marker, corners_px)
-    hopeless_px = max(HOPELESS_RMS_PX, HOPELESS_RATIO * min(rms_px, default=0.0))
+    corners = template_of_layers(tuple(seen.layer for seen in layers))
+    corners_px = np.concatenate([seen.corners_px for seen in layers])
+    if known is None:
+        largest = min(layers, key=lambda seen: seen.layer)
+        starts = poses_from_square(camera, _SQUARES[largest.layer], largest.corners_px, side_m, surface)
+    else:
+        starts = [known, mirrored(known)]
+    if not starts:
+        return ()
+    points_marker = on_surface(surface, side_m, corners)[0]
+    squared_px = _squared_errors(camera, starts, points_marker, corners_px)
+    rms_px = np.sqrt(squared_px.mean(axis=1))
+    hopeless_px = max(HOPELESS_RMS_PX, HOPELESS_RATIO * min(rms_px))
+    refine = [start is not known and rms <= hopeless_px for start, rms in zip(starts, rms_px.tolist(), strict=True)]
     poses = [
-        _refined(camera, start, points_marker, corners_px) if rms <= hopeless_px else start
-        for start, rms in zip(starts, rms_px, strict=True)
+        _refined(camera, start, points_marker, corners_px) if worth else start
+        for start, worth in zip(starts, refine, strict=True)
     ]
-    rms_px = _reprojection_rms(camera, poses, points_marker, corners_px)
-    found = [PlanarPose(T_cam_marker, rms) for T_cam_marker, rms in zip(poses, rms_px, strict=True)]
-    return tuple(sorted(found, key=lambda planar: planar.reprojection_rms_px))
+    if any(refine):
+        squared_px = _squared_errors(camera, poses, points_marker, corners_px)
+        rms_px = np.sqrt(squared_px.mean(axis=1))
+    misfit = squared_px @ np.repeat([seen.sigma_px**-2 for seen in layers], 4)
+    likely = np.exp(-0.5 * (misfit - misfit.min()))
+    found = zip(poses, rms_px.tolist(), (likely / likely.sum()).tolist(), strict=True)
+    return tuple(sorted((PlanarPose(*one) for one in found), key=lambda planar: -planar.probability))
 
 
-def _reprojection_rms(camera: Camera, poses: Sequence[Array], points_marker: Array, seen_px: Array) -> list[float]:
-    """Return how far points (N, 3) of the marker are from where they are seen (N, 2) under each pose, rms pixels."""
-    if not poses:
-        return []
-    points_cam = np.concatenate([transform(T_cam_marker, points_marker) for T_cam_marker in poses])
+def mirrored(T_cam_marker: Array) -> Array:
+    """Return the pose that looks the same from so far that perspective does not tell them apart.
+
+    The plane is mirrored in depth, along the line of sight to the marker's centre (Schweighofer and Pinz, "Robust pose
+    estimation from a planar target", PAMI 2006).
+    """
+    t = T_cam_marker[:3, 3]
+    towards = t / np.sqrt(t @ t)
+    R = T_cam_marker[:3, :3] - 2 * np.outer(towards, towards @ T_cam_marker[:3, :3])
+    R[:, 2] *= -1
+    return pose(R, t)
+
+
+@lru_cache(maxsize=8)
+def template_of_layers(layers: tuple[int, ...]) -> Array:
+    """Return the corners (4 L, 2) of layers' black squares, template units, not to be changed."""
+    corners = np.concatenate([_SQUARES[layer] for layer in layers])
+    corners.flags.writeable = False
+    return corners
+
+
+def _squared_errors(camera: Camera, poses: Sequence[Array], points_marker: Array, seen_px: Array) -> Array:
+    """Return how far points (3, N) of the marker are from where they are seen (N, 2) under P poses: (P, N) px^2."""
+    stacked = np.array(poses).reshape(-1, 4, 4)
+    points_cam = stacked[:, :3, :3] @ points_marker + stacked[:, :3, 3:]
     points_cam[:, 2] = np.maximum(points_cam[:, 2], 1e-6)  # behind the camera is far outside every image
-    at = camera.project(points_cam).reshape(len(poses), -1, 2)
-    return [float(rms) for rms in np.sqrt(((at - seen_px) ** 2).sum(axis=(1, 2)) / len(seen_px))]
+    at = camera.project(points_cam.transpose(0, 2, 1)).T.reshape(2, len(stacked), -1)
+    off = at - seen_px.T[:, None]
+    return off[0] * off[0] + off[1] * off[1]
 
 
 def _refined(camera: Camera, T_cam_marker: Array, points_marker: Array, seen_px: Array) -> Array:
-    """Return a pose refined on points (N, 3) of the marker seen at (N, 2) pixels; as it was where that fails."""
+    """Return a pose refined on points (3, N) of the marker seen at (N, 2) pixels; as it was where that fails."""
     rotation, translation = cv2.solvePnPRefineLM(
-        points_marker,
+        np.ascontiguousarray(points_marker.T),
         seen_px,
         camera.K,
         camera.distortion,
@@ -116,31 +158,30 @@ def _refined(camera: Camera, T_cam_marker: Array, points_marker: Array, seen_px:
     return pose(cv2.Rodrigues(rotation)[0], translation)
 
 
-def _corners(layers: Sequence[LayerDetection]) -> Array:
-    """Return all corners of the layers, (4 L, 2) pixels."""
-    return np.concatenate([seen.corners_px for seen in layers])
-
-
 def refine_on_corners(start: PoseWarp, layers: Sequence[LayerDetection]) -> CornerPose:
     """Return the pose that fits all corners of all layers best, weighted by their sigmas, from a start nearby.
 
     Levenberg-Marquardt over the corners as they lie on the marker's surface.  The covariance follows from the
     corners' sigmas, enlarged when the corners do not fit as well as these promise.
     """
-    template = np.concatenate([square(*LAYERS[seen.layer].black) for seen in layers])
-    corners_px = _corners(layers)
+    template = template_of_layers(tuple(seen.layer for seen in layers))
+    corners_px = np.concatenate([seen.corners_px for seen in layers])
     sigma_px = np.repeat([seen.sigma_px for seen in layers], 8)
     warp, damping = start, 1e-3
 
     def error(candidate: PoseWarp) -> Array:
         return (corners_px - candidate(template)).ravel() / sigma_px
 
+    def scaled(candidate: PoseWarp) -> tuple[Array, Array]:
+        J = candidate.jacobian(template).reshape(-1, 6) / sigma_px[:, None]
+        scale = np.linalg.norm(J, axis=0) + LEAST_SCALE  # metres and radians differ by orders: solve in pixels
+        return J / scale, scale
+
     residual = error(warp)
     for _ in range(MAX_STEPS):
-        J = warp.jacobian(template).reshape(-1, 6) / sigma_px[:, None]
-        information = J.T @ J
-        delta = np.linalg.solve(information + damping * np.diag(np.diag(information)), J.T @ residual)
-        moved = warp.stepped(delta)
+        J, scale = scaled(warp)
+        delta = np.linalg.solve(J.T @ J + damping * np.eye(6), J.T @ residual)
+        moved = warp.stepped(delta / scale)
         after = error(moved)
         gain = residual @ residual - after @ after
         if gain <= 0:
@@ -151,7 +192,8 @@ def refine_on_corners(start: PoseWarp, layers: Sequence[LayerDetection]) -> Corn
         warp, residual, damping = moved, after, damping / 10
         if gain <= CONVERGED_PX2 * (1 + after @ after):
             break
-    misfit = max(1.0, residual @ residual / max(len(residual) - 6, 1))
-    J = warp.jacobian(template).reshape(-1, 6) / sigma_px[:, None]
+    misfit = max(1.0, float(residual @ residual) / max(len(residual) - 6, 1))
+    J, scale = scaled(warp)
+    covariance = misfit * np.linalg.inv(J.T @ J + UNSEEN * np.eye(6)) / np.outer(scale, scale)
     reprojection_rms_px = float(np.sqrt(((residual * sigma_px) ** 2).reshape(-1, 2).sum(axis=1).mean()))
-    return CornerPose(warp.T_cam_marker, misfit * np.linalg.inv(J.T @ J), reprojection_rms_px)
+    return CornerPose(warp.T_cam_marker, covariance, reprojection_rms_px)

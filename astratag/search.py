@@ -6,7 +6,6 @@ Pixels: (0, 0) is the centre of the top-left pixel.  Corners run clockwise in th
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import chain
 from typing import NamedTuple
 
 import cv2
@@ -33,7 +32,8 @@ class Binarisation(NamedTuple):
     """
 
 
-COARSE = Binarisation(scale=0.5)
+COARSE = Binarisation(scale=0.5, offset=14)
+"""For a first look: large squares, clearly darker than their surroundings, which most textures are not."""
 PLAIN = Binarisation()
 NARROW = Binarisation(smooth_px=1, window_px=7)
 """For squares so small, or seen at such a slant, that their borders are a pixel or two wide."""
@@ -50,13 +50,19 @@ THIN = Binarisation(scale=2.0, smooth_px=1, window_px=9)
 
 POLYGON_TOLERANCES = (0.03, 0.05, 0.015, 0.08)
 """Fractions of the perimeter, most useful first; skinny quads need the small ones, bent squares the large."""
+WHOLE_TOLERANCES = 2
+"""How many of them a square needs that is whole, not very skinny, and not very bent."""
 BENT_TOLERANCE = 0.015
 MAX_VERTICES = 16
+LEAST_TURN = 0.2
+"""Radians by which the outline of a bent square turns at each of its corners."""
 
 MIN_PERIMETER_PX = 24.0
 MIN_SIDE_PX = 3.0
 LEAST_ROUNDNESS = 0.009
 """Area over squared perimeter: 0.0625 of a square, 0.03 of one seen at 80 degrees, less of ragged shapes."""
+NOISE = 0.3
+"""Share of pixels that are ink where their neighbour is not, or the reverse, from which a picture is noise."""
 MAX_CONTOURS = 500
 MAX_BENT_OUTLINES = 120
 OUTSET_PX, INSET_PX = 0.75, -0.5
@@ -97,7 +103,9 @@ def find_outlines(gray: Image, how: Binarisation = PLAIN) -> Outlines:
     smooth = cv2.blur(gray, (how.smooth_px,) * 2) if how.smooth_px > 1 else gray
     kind, offset = (cv2.THRESH_BINARY, -how.offset) if how.holes else (cv2.THRESH_BINARY_INV, how.offset)
     shapes = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, kind, how.window_px, offset)
-    contours, _ = cv2.findContours(shapes, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
+    changes = cv2.countNonZero(cv2.absdiff(shapes[:, 1:], shapes[:, :-1]))
+    noisy = changes > NOISE * shapes.size  # hundreds of thousands of contours, and none of them a square
+    contours = () if noisy else cv2.findContours(shapes, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)[0]
     if how.holes:
         contours = [contour[::-1] for contour in contours]  # holes are run around the other way
     found = sorted(_plausible(contours), key=lambda outline: -outline[0])[:MAX_CONTOURS]
@@ -109,16 +117,35 @@ def find_quads(gray: Image, how: Binarisation = PLAIN) -> Array:
     return quads_of(find_outlines(gray, how))
 
 
-def quads_of(outlines: Outlines) -> Array:
-    """Return the quads (Q, 4, 2) that outlines may be when their sides are straight."""
-    quads = list(chain.from_iterable(_quads_of(contour, perimeter) for perimeter, contour in outlines.contours))
-    return outlines.in_image(_grown(np.array(quads, dtype=float).reshape(-1, 4, 2), outlines.outset_px))
+def quads_of(outlines: Outlines, *, whole: bool = False) -> Array:
+    """Return the quads (Q, 4, 2) that outlines may be when their sides are straight.
+
+    ``whole`` leaves out outlines that are ragged, cut or covered: seldom squares, and long to look at.
+    """
+    found = (_simplified(contour, perimeter, whole) for perimeter, contour in outlines.contours)
+    quads = np.array([polygon for polygon in found if polygon is not None], dtype=float).reshape(-1, 4, 2)
+    turned = _cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1]) < 0
+    quads[turned] = quads[turned, ::-1]
+    quads = quads[_squared(quads[:, [1, 2, 3, 0]] - quads).min(axis=1) >= MIN_SIDE_PX**2]
+    return outlines.in_image(_grown(quads, outlines.outset_px))
 
 
 def bent_quads_of(outlines: Outlines) -> BentQuads:
     """Return what outlines may be when their sides bulge: the four sharpest corners, and how they run between."""
-    found = [_bent(contour, perimeter) for perimeter, contour in outlines.contours[:MAX_BENT_OUTLINES]]
-    corners, bulges = (np.array([f[i] for f in found if f is not None]).reshape(-1, 4, 2) for i in (0, 1))
+    contours, polygons = [], []
+    for perimeter, contour in outlines.contours[:MAX_BENT_OUTLINES]:
+        polygon = cv2.approxPolyDP(contour, BENT_TOLERANCE * perimeter, True)
+        if 4 <= len(polygon) <= MAX_VERTICES:
+            contours.append(contour[::-1])  # contours around ink run counter-clockwise in the image
+            polygons.append(polygon[::-1])
+    if not contours:
+        return BentQuads(*np.zeros((2, 0, 4, 2)))
+    corners, sharp = _sharpest(polygons)
+    sharp &= _squared(corners[:, [1, 2, 3, 0]] - corners).min(axis=1) >= MIN_SIDE_PX**2
+    corners, contours = corners[sharp], [contours[i] for i in np.flatnonzero(sharp)]
+    if not contours:
+        return BentQuads(*np.zeros((2, 0, 4, 2)))
+    corners, bulges = _bulging(contours, corners)
     return BentQuads(outlines.in_image(_grown(corners, outlines.outset_px)), outlines.scale * bulges)
 
 
@@ -133,61 +160,73 @@ def _plausible(contours: Sequence[NDArray[np.int32]]) -> Iterator[tuple[float, N
                     yield perimeter, contour
 
 
+def _cross(a: Array, b: Array) -> Array:
+    """Return the cross products (...) of vectors (..., 2)."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def _squared(a: Array) -> Array:
+    """Return the squared lengths (...) of vectors (..., 2)."""
+    return a[..., 0] * a[..., 0] + a[..., 1] * a[..., 1]
+
+
 def _grown(quads: Array, outset_px: float) -> Array:
     """Return quads (Q, 4, 2) with each side moved out."""
-    ahead = np.roll(quads, -1, axis=1) - quads
-    along = ahead / np.maximum(np.linalg.norm(ahead, axis=2, keepdims=True), 1e-9)
-    before = np.roll(along, 1, axis=1)
-    sine = np.maximum(before[..., 0] * along[..., 1] - before[..., 1] * along[..., 0], LEAST_SINE)
-    return quads + outset_px * (before - along) / sine[..., None]
+    ahead = quads[:, [1, 2, 3, 0]] - quads
+    along = ahead / np.maximum(np.sqrt(_squared(ahead)), 1e-9)[..., None]
+    before = along[:, [3, 0, 1, 2]]
+    return quads + outset_px * (before - along) / np.maximum(_cross(before, along), LEAST_SINE)[..., None]
 
 
-def _quads_of(contour: NDArray[np.int32], perimeter: float) -> Iterator[Array]:
-    """Yield the quads that one contour may be: itself simplified, and its hull simplified, when they differ."""
-    direct = _simplified(contour, perimeter)
-    if direct is not None:
-        yield direct
-    hull = cv2.convexHull(contour)
-    if direct is None and len(hull) >= 4:
-        around = _simplified(hull, cv2.arcLength(hull, True))
-        if around is not None:
-            yield around
+def _simplified(contour: NDArray[np.int32], perimeter: float, whole: bool) -> NDArray[np.int32] | None:
+    """Return the convex quad (4, 1, 2) that a contour simplifies to at the first tolerance that gives one.
 
-
-def _simplified(contour: NDArray[np.int32], perimeter: float) -> Array | None:
-    """Return the convex quad (4, 2) the contour simplifies to at the first tolerance that gives one."""
-    for tolerance in POLYGON_TOLERANCES:
+    Else the one that its hull does, unless only a ``whole`` square will do.
+    """
+    for tolerance in POLYGON_TOLERANCES[: WHOLE_TOLERANCES if whole else None]:
         polygon = cv2.approxPolyDP(contour, tolerance * perimeter, True)
         if len(polygon) == 4 and cv2.isContourConvex(polygon):
-            quad = polygon.reshape(4, 2).astype(float)
-            sides = np.linalg.norm(np.roll(quad, -1, axis=0) - quad, axis=1)
-            if sides.min() < MIN_SIDE_PX:
-                return None
-            return quad if cv2.contourArea(polygon, True) > 0 else quad[::-1]
+            return polygon
+    if not whole:
+        hull = cv2.convexHull(contour)
+        if 4 <= len(hull) < len(contour):
+            return _simplified(hull, cv2.arcLength(hull, True), False)
     return None
 
 
-def _bent(contour: NDArray[np.int32], perimeter: float) -> tuple[Array, Array] | None:
-    """Return the four sharpest corners (4, 2) of a contour, clockwise, and the bulges (4, 2) of the sides between."""
-    polygon = cv2.approxPolyDP(contour, BENT_TOLERANCE * perimeter, True)
-    if not 4 <= len(polygon) <= MAX_VERTICES:
-        return None
-    vertices = polygon[::-1, 0].astype(float)  # contours around ink run counter-clockwise in the image
-    ahead = np.roll(vertices, -1, axis=0) - vertices
-    before = np.roll(ahead, 1, axis=0)
-    turn = np.arctan2(before[:, 0] * ahead[:, 1] - before[:, 1] * ahead[:, 0], (before * ahead).sum(axis=1))
-    corners = vertices[np.sort(np.argsort(-turn)[:4])]
-    chords = np.roll(corners, -1, axis=0) - corners
-    if np.linalg.norm(chords, axis=1).min() < MIN_SIDE_PX or turn[np.argsort(-turn)[3]] < 0.2:
-        return None
-    points = contour[::-1, 0].astype(float)
-    at = ((points[:, None] - corners) ** 2).sum(axis=2).argmin(axis=0)
-    bulges = np.zeros((4, 2))
-    for side, chord in enumerate(chords):
-        between = np.roll(points, -at[side], axis=0)[: (at[(side + 1) % 4] - at[side]) % len(points) + 1]
-        length = np.linalg.norm(chord)
-        outward = np.array([chord[1], -chord[0]]) / length
-        along = (between - corners[side]) @ chord / length**2
-        profile = 4 * along * (1 - along)
-        bulges[side] = outward * (profile @ ((between - corners[side]) @ outward) / (profile @ profile + 0.5))
-    return corners, bulges
+def _sharpest(polygons: Sequence[NDArray[np.int32]]) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the four vertices of each polygon (N, 1, 2) that turn most (B, 4, 2), and which turn enough (B,)."""
+    lengths = np.array([len(polygon) for polygon in polygons])
+    rows, column = np.arange(len(polygons))[:, None], np.arange(MAX_VERTICES)
+    vertices = np.zeros((len(polygons), MAX_VERTICES, 2))
+    vertices[column < lengths[:, None]] = np.concatenate(polygons)[:, 0]
+    after = vertices[rows, np.where(column + 1 < lengths[:, None], column + 1, 0)] - vertices
+    before = vertices - vertices[rows, np.where(column > 0, column - 1, lengths[:, None] - 1)]
+    turn = np.arctan2(_cross(before, after), (before * after).sum(axis=2))
+    turn[column >= lengths[:, None]] = -np.inf
+    order = np.argsort(-turn, axis=1, kind="stable")[:, :4]
+    return vertices[rows, np.sort(order, axis=1)], turn[rows[:, 0], order[:, 3]] >= LEAST_TURN
+
+
+def _bulging(contours: Sequence[NDArray[np.int32]], corners: Array) -> tuple[Array, Array]:
+    """Return four corners (B, 4, 2) on each contour, and the bulges (B, 4, 2) of the sides between, as parabolas."""
+    points = np.concatenate(contours)[:, 0].astype(float)
+    lengths = np.array([len(contour) for contour in contours])
+    owner, starts = np.repeat(np.arange(len(contours)), lengths), np.cumsum(lengths) - lengths
+    apart = _squared(points[:, None] - corners[owner])
+    at_corner = apart == np.minimum.reduceat(apart, starts)[owner]
+    place = np.where(at_corner, np.arange(len(points))[:, None], len(points))
+    places = np.minimum.reduceat(place, starts)
+    order = np.argsort(places, axis=1)
+    corners = np.take_along_axis(corners, order[..., None], axis=1)
+    places = np.take_along_axis(places, order, axis=1)
+    side = (np.arange(len(points))[:, None] >= places[owner]).sum(axis=1) - 1  # -1, before the first, is the last
+    chords = corners[:, [1, 2, 3, 0]] - corners
+    outward = np.stack([chords[..., 1], -chords[..., 0]], axis=2) / np.sqrt(_squared(chords))[..., None]
+    from_corner, chord = points - corners[owner, side], chords[owner, side]
+    along = (from_corner * chord).sum(axis=1) / _squared(chord)
+    profile = 4 * along * (1 - along)
+    key, count = 4 * owner + side % 4, 4 * len(contours)
+    off = np.bincount(key, profile * (from_corner * outward[owner, side]).sum(axis=1), count)
+    height = off / (np.bincount(key, profile**2, count) + 0.5)
+    return corners, outward * height.reshape(-1, 4)[..., None]

@@ -8,13 +8,15 @@ removed, and what is left is correlated with every code in every orientation: so
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.codes import Reading
+from astratag.codes import Reading, acceptance_threshold
+from astratag.codes.acceptance import FALSE_ACCEPT_RATE
+from astratag.codes.soft import correlations
 from astratag.dictionary import Dictionary
 from astratag.geometry import (
     CELLS,
@@ -29,13 +31,19 @@ from astratag.geometry import (
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
+Brightness = NDArray[np.uint8] | NDArray[np.float32]
+"""An image (H, W): gray values as they are, or linear light."""
 Warp = Callable[[Array], Array]
 """Takes template points (..., 2) to pixels (..., 2)."""
 
-ACCEPT = 0.72
-"""Cells-only correlation of chance patterns exceeds this once in a million candidates."""
-ACCEPT_OF_MANY_WARPS = 0.78
-"""The same when a candidate is read through several warps and the best counts."""
+PROMISING_RATE = 0.02
+"""The share of chance patterns that may read well enough to be worth fitting."""
+LIKELY_RATE = 0.001
+"""The share whose reading through the edges of one layer may be worth fitting all the others."""
+EFFECTIVE_SHARE = 45 / CELLS
+"""How many independent cells one counts for: by ``effective_cells``, of squares of any size in 130 000 photographs'."""
+LEAST_SEEN = CELLS // 2
+"""With fewer cells seen chance fits better than it should: what hides the others has a shape too."""
 
 
 def _cell_samples() -> Array:
@@ -67,8 +75,13 @@ def _smooth(points: Array) -> Array:
 CELL_SAMPLES = _cell_samples()
 ALWAYS_BLACK = _always_black()
 SAMPLES = np.concatenate([CELL_SAMPLES.reshape(-1, 2), ALWAYS_BLACK])
+_LAYER_SAMPLES = [layer_points(SAMPLES, layer) for layer in LAYERS]
+for _samples in _LAYER_SAMPLES:
+    _samples.flags.writeable = False  # so that warps may keep where they are on a surface
 BLUR_UNITS = (0.0, 60.0, 120.0)
 """Widths of box blurs, template units, at which codes are known: what small squares look like."""
+BLURRED_CELLS = (CELLS, 25, 21)
+"""How many cells a correlation with such codes is worth, measured likewise: blur makes them alike."""
 PIXEL_BLUR = 2.8
 """Width in pixels of the box blur that is like a lens's and a pixel's together (sigma 0.8)."""
 _ILLUMINATION = _smooth(CELL_SAMPLES.mean(axis=1)) @ np.linalg.pinv(_smooth(ALWAYS_BLACK))
@@ -76,35 +89,101 @@ _ILLUMINATION = _smooth(CELL_SAMPLES.mean(axis=1)) @ np.linalg.pinv(_smooth(ALWA
 
 
 class Codebook:
-    """A dictionary ready for correlation."""
+    """A dictionary ready for correlation, and which correlations are more than chance.
 
-    def __init__(self, dictionary: Dictionary) -> None:
+    ``tau_hamming``, unless None, is the paper's rule instead: so many cells may be wrong.
+    """
+
+    def __init__(
+        self,
+        dictionary: Dictionary,
+        false_accept_rate: float = FALSE_ACCEPT_RATE,
+        tau_hamming: int | None = None,
+    ) -> None:
+        if tau_hamming is not None and not (isinstance(tau_hamming, int) and 0 <= tau_hamming < CELLS):
+            raise ValueError(f"tau_hamming is how many of {CELLS} cells may be wrong, an integer, got {tau_hamming!r}")
         self.dictionary = dictionary
-        codes = dictionary.oriented.reshape(-1, CELLS).astype(float)
-        self._unit_codes = [unit(codes @ mixing.T + around) for mixing, around in _mixings()]
+        self.false_accept_rate = false_accept_rate
+        self.tau_hamming = tau_hamming
+        self._codes = dictionary.oriented.reshape(-1, CELLS).astype(float)
+        self.unit_codes = [unit(self._codes @ mixing.T + around) for mixing, around in _mixings()]
+        self._threshold = lru_cache(maxsize=None)(partial(acceptance_threshold, len(self._codes)))
+        self.least(1)  # refuses a rate that is none
+
+    def least(self, warps: int, cells: int = CELLS) -> float:
+        """Return the correlation that the best of ``warps`` readings of a chance pattern rarely exceeds."""
+        return self._threshold(warps, self.false_accept_rate, EFFECTIVE_SHARE * cells)
+
+    def least_blurred(self, other_chance: float) -> float:
+        """Return the same of the most blurred codes, for squares also asked for what chance has so seldom."""
+        rate = min(self.false_accept_rate / other_chance, PROMISING_RATE)
+        return self._threshold(1, rate, EFFECTIVE_SHARE * BLURRED_CELLS[-1])
+
+    def promising(self, cells: int = CELLS) -> float:
+        """Return the correlation through a rough quad from which it is worth fitting."""
+        return self._threshold(1, PROMISING_RATE, EFFECTIVE_SHARE * cells)
+
+    def likely(self, cells: int) -> float:
+        """Return the correlation through one layer's own edges from which the others are worth fitting."""
+        return self._threshold(1, LIKELY_RATE, EFFECTIVE_SHARE * cells)
+
+    def excess(self, reading: Reading) -> float:
+        """Return how much better a reading correlates than chance would."""
+        return reading.correlation - self.least(1, reading.cells)
+
+    def accepts(self, reading: Reading, warps: int) -> bool:
+        """Return whether a reading, the best of so many ``warps`` and blurs, is a marker's."""
+        if self.tau_hamming is not None:
+            return reading.hamming <= self.tau_hamming
+        return reading.correlation >= self.least(warps * len(BLUR_UNITS), reading.cells)
 
     def read(self, cells: Array, side_px: Array | None = None) -> list[Reading]:
         """Return the best reading of each row of cells (Q, 48); ``side_px`` (Q,) is how large each square looks."""
         if len(cells) == 0:
             return []
         levels = np.zeros(len(cells), dtype=int) if side_px is None else blur_level(side_px)
-        correlations = np.empty((len(cells), len(self._unit_codes[0])))
+        found = np.empty((len(cells), len(self._codes)))
         for level in np.unique(levels):
             rows = levels == level
-            correlations[rows] = np.einsum("qc,kc->qk", unit(cells[rows]), self._unit_codes[level])
-        best = correlations.argmax(axis=1)
-        wrong = hamming(cells, self.dictionary.oriented.reshape(-1, CELLS)[best])
+            found[rows] = np.einsum("qc,kc->qk", unit(cells[rows]), self.unit_codes[level])
+        return self._best(found, cells, np.ones(cells.shape, dtype=bool))
+
+    def read_seen(self, cells: Array, seen: NDArray[np.bool_]) -> list[Reading]:
+        """Return the best reading of each row of cells (Q, 48) when only those that are ``seen`` (Q, 48) count."""
+        return self._best(correlations(cells, seen, self._codes), cells, seen)
+
+    def _best(self, found: Array, cells: Array, seen: NDArray[np.bool_]) -> list[Reading]:
+        """Return the readings that correlate best among all ``found`` (Q, 4 N)."""
+        best = found.argmax(axis=1)
+        wrong = hamming(cells, self.dictionary.oriented.reshape(-1, CELLS)[best], seen)
+        count = seen.sum(axis=1)
         return [
-            Reading(self.dictionary.ids[b // 4], int(b % 4), float(correlations[q, b]), int(wrong[q]))
+            Reading(self.dictionary.ids[b // 4], int(b % 4), float(found[q, b]), int(wrong[q]), cells=int(count[q]))
             for q, b in enumerate(best)
         ]
 
-    def read_as(self, cells: Array, marker_id: int, side_px: float = np.inf) -> Reading:
-        """Return how well cells (48,) fit an upright marker of a known identity that looks ``side_px`` large."""
-        row = self.dictionary.ids.index(marker_id)
-        codes = self._unit_codes[int(blur_level(np.array(side_px)))]
-        correlation = float(unit(cells[None])[0] @ codes[4 * row])
-        return Reading(marker_id, 0, correlation, int(hamming(cells[None], self.dictionary.signatures[row][None])[0]))
+    def read_as(self, cells: Array, marker_id: int, side_px: float | None = None) -> Reading:
+        """Return how well cells (48,) fit an upright marker of a known identity.
+
+        One that looks ``side_px`` large, or as blurred as chance explains least.
+        """
+        row = self.dictionary.row(marker_id)
+        found = np.array([codes[4 * row] for codes in self.unit_codes]) @ unit(cells[None])[0]
+        if side_px is None:
+            level = int((found - [self.least(1, worth) for worth in BLURRED_CELLS]).argmax())
+        else:
+            level = int(blur_level(np.array(side_px)))
+        wrong = int(hamming(cells[None], self.dictionary.signatures[row][None])[0])
+        return Reading(marker_id, 0, float(found[level]), wrong, cells=BLURRED_CELLS[level])
+
+    def read_seen_as(self, cells: Array, seen: NDArray[np.bool_], marker_id: int) -> Reading:
+        """Return how well the ``seen`` (48,) of cells (48,) fit an upright marker of a known identity."""
+        code = self.dictionary.signature(marker_id)[None]
+        if seen.sum() < LEAST_SEEN:
+            return Reading(marker_id, 0, 0.0, int(seen.sum()), cells=LEAST_SEEN)
+        correlation = float(correlations(cells, seen[None], code.astype(float))[0, 0])
+        wrong = int(hamming(cells[None], code, seen[None])[0])
+        return Reading(marker_id, 0, correlation, wrong, cells=int(seen.sum()))
 
 
 def blur_level(side_px: Array) -> NDArray[np.int64]:
@@ -138,16 +217,21 @@ def unit(cells: Array) -> Array:
     return centred / np.where(length > 1e-9, length, np.inf)
 
 
-def hamming(cells: Array, codes: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Return how many cells of each row (Q, 48) are on the wrong side of half way from its code's black to white."""
-    ones = codes.sum(axis=1)
-    white = (cells * codes).sum(axis=1) / np.maximum(ones, 1)
-    black = (cells * (1 - codes)).sum(axis=1) / np.maximum(CELLS - ones, 1)
-    return ((cells > ((white + black) / 2)[:, None]) != (codes == 1)).sum(axis=1)
+def hamming(cells: Array, codes: NDArray[np.uint8], seen: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
+    """Return how many of the ``seen`` cells of each row (Q, 48) are on the wrong side of half way from black to white.
+
+    Half way between the means of those that its code (Q, 48) has black and white.
+    """
+    white, black = codes == 1, codes == 0
+    if seen is None:
+        seen = np.ones(cells.shape, dtype=bool)
+    white, black = white & seen, black & seen
+    middle = sum((cells * part).sum(axis=1) / np.maximum(part.sum(axis=1), 1) for part in (white, black)) / 2
+    return (seen & ((cells > middle[:, None]) != white)).sum(axis=1)
 
 
-def sample(gray: Image, points_px: Array | NDArray[np.float32]) -> Array:
-    """Return gray values at pixels (N, M, 2), interpolated; 0 outside the image."""
+def sample(gray: Brightness, points_px: Array | NDArray[np.float32]) -> Array:
+    """Return gray or light values at pixels (N, M, 2), interpolated; 0 outside the image."""
     points = np.clip(points_px.astype(np.float32, copy=False), -1e4, 1e4)
     flat = points.reshape(-1, 1, 2)
     if len(flat) < 32_000:
@@ -155,7 +239,7 @@ def sample(gray: Image, points_px: Array | NDArray[np.float32]) -> Array:
     return cv2.remap(gray, points, None, cv2.INTER_LINEAR).astype(float)
 
 
-def cell_values(gray: Image, samples_px: Array | NDArray[np.float32]) -> Array:
+def cell_values(gray: Brightness, samples_px: Array | NDArray[np.float32]) -> Array:
     """Return the 48 cell means (Q, 48), black level removed, of patterns sampled at ``SAMPLES`` (Q, S, 2)."""
     values = sample(gray, samples_px)
     cells = values[:, : CELL_SAMPLES.shape[0] * CELL_SAMPLES.shape[1]].reshape(len(values), CELLS, -1).mean(axis=2)
@@ -163,9 +247,9 @@ def cell_values(gray: Image, samples_px: Array | NDArray[np.float32]) -> Array:
     return cells - np.einsum("qb,cb->qc", values[:, -len(ALWAYS_BLACK) :], _ILLUMINATION)
 
 
-def layer_cells(gray: Image, warp: Warp, layer: int) -> Array:
+def layer_cells(gray: Brightness, warp: Warp, layer: int) -> Array:
     """Return the cells (48,) of one layer of a marker whose print is warped into the image."""
-    return cell_values(gray, warp(layer_points(SAMPLES, LAYERS[layer]))[None])[0]
+    return cell_values(gray, warp(_LAYER_SAMPLES[layer])[None])[0]
 
 
 class Artwork:

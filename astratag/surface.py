@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from astratag.checks import finite, positive
+
 Array = NDArray[np.float64]
 
 
@@ -39,10 +41,8 @@ class Cylinder:
     axis_rad: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.radius_m) and self.radius_m > 0):
-            raise ValueError(f"radius_m must be positive and finite, got {self.radius_m}; a flat marker is Flat()")
-        if not np.isfinite(self.axis_rad):
-            raise ValueError(f"axis_rad must be finite, got {self.axis_rad}")
+        positive(self.radius_m, "radius_m", "length in metres, and a flat marker is Flat()")
+        finite(self.axis_rad, "axis_rad")
 
     @property
     def _along_across(self) -> tuple[Array, Array]:

@@ -246,9 +246,16 @@ class Alignment(Generic[W]):
 
         As if all were independent: as many of them as the warp has parameters tell no more than these.
         """
+        return float(np.sqrt(self._variance_px2(template) + SIGMA_FLOOR_PX**2))
+
+    @property
+    def cautious_covariance(self) -> Array:
+        """Return the covariance (P, P) enlarged so that the outer corners are known no better than ``sigma_px``."""
+        return (1 + SIGMA_FLOOR_PX**2 / self._variance_px2(square(0.0, TEMPLATE_UNITS))) * self.covariance
+
+    def _variance_px2(self, template: Array) -> float:
         J = self.warp.jacobian(template)
-        variance = np.einsum("nip,pq,niq->", J, self.covariance, J) / len(self.covariance)
-        return float(np.sqrt(variance + SIGMA_FLOOR_PX**2))
+        return float(np.einsum("nip,pq,niq->", J, self.covariance, J)) / len(self.covariance)
 
 
 class Synthesis:

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from astratag.camera import Camera
 from astratag.candidates import OUTER
+from astratag.checks import instance
 from astratag.detection import Detection
-from astratag.detector import HALVE_FROM_PX, POLISHED_PX, Detector, View, surest
+from astratag.detector import ALIGNED_POLISHED_PX, COST_LIMIT, EVERY_WAY, HALVE_FROM_PX, Detector, View, surest
+from astratag.edges import EDGE_LAYER
 from astratag.fit import fit_edges
 from astratag.grow import ALL_EDGES, SETTLED_PX, Fit, grow, layer_side_px, settle
 from astratag.search import COARSE, PLAIN, find_outlines
@@ -23,12 +25,14 @@ Array = NDArray[np.float64]
 
 SEARCH_EVERY = 10
 """Frames between searches of the whole image for markers not yet tracked."""
-STEADY_PX, TRACK_PX = 3.0, 6.0
+STEADY_PX, TRACK_PX = 2.0, 6.0
 """How far from its prediction an edge may be when the marker moves on as before, and when it does not."""
-COST_LIMIT = 1.0
-"""Mean truncated squared residual (of 9 at most) above which a followed fit is not believed."""
+OUTER_EDGES = ALL_EDGES[EDGE_LAYER < 2]
+"""Of a marker that moves on as before: the innermost square adds less than a hundredth to what these tell."""
+CERTAIN = 0.9999
+"""Probability of the other planar pose from which a tracked marker is taken to be there instead."""
 LEAST_BOX_PX = 16
-FIT_MARGIN, LOCAL_MARGIN = 0.15, 0.5
+FIT_MARGIN, LOCAL_MARGIN = 0.05, 0.5
 """How much wider than the marker, on each side as a fraction of its size, a fit and a local search look."""
 FIT_MARGIN_PX = TRACK_PX + 6.0
 
@@ -38,6 +42,7 @@ class Track:
     """Where one marker was in the last frame and the one before (None when it was not seen then)."""
 
     marker_id: int
+    corners_px: Array
     T_cam_marker: Array
     T_cam_marker_before: Array | None
 
@@ -60,13 +65,14 @@ class Tracker:
     """
 
     def __init__(self, detector: Detector) -> None:
-        self.detector = detector
+        self.detector = instance(detector, Detector, "detector", "the tracker adds memory to one")
         self._tracks: list[Track] = []
         self._frames = 0
+        self._searches = 0
 
     def reset(self) -> None:
         """Forget all markers, as before the first image."""
-        self._tracks, self._frames = [], 0
+        self._tracks, self._frames, self._searches = [], 0, 0
 
     def detect(self, image: NDArray[np.uint8], camera: Camera | None = None) -> list[Detection]:
         """Return the markers in the next image, the surest first; without ``camera`` every image is searched.
@@ -75,9 +81,12 @@ class Tracker:
         """
         found, before = self._follow_all(image, camera) if camera is not None and self._tracks else ([], {})
         if not found or len(found) < len(self._tracks) or (self._frames % SEARCH_EVERY == 0 and not self._all(found)):
-            found = surest(self.detector.find(self.detector.view(image, camera)), first=found)
+            view = self.detector.view(image, camera)
+            found = surest(self.detector.find(view), first=found)
+            found = self.detector.find_missing(view, found, [EVERY_WAY[self._searches % len(EVERY_WAY)]])
+            self._searches += 1
         self._tracks = [
-            Track(seen.marker_id, seen.T_cam_marker, before.get(id(seen)))
+            Track(seen.marker_id, seen.corners_px, seen.T_cam_marker, before.get(id(seen)))
             for seen in found
             if seen.T_cam_marker is not None
         ]
@@ -104,27 +113,37 @@ class Tracker:
         return surest(found), before
 
     def _around(self, track: Track, camera: Camera) -> Array:
-        """Return where the corners (4 N, 2) of a tracked marker may be."""
+        """Return where the corners (8, 2) of a tracked marker may be: where they were, and moved on."""
         spec = self.detector.spec(track.marker_id)
-        surface = spec.surface or Flat()
-        return np.concatenate([PoseWarp(camera, spec.side_m, surface, T)(OUTER) for T in track.predictions])
+        moved_on = PoseWarp(camera, spec.side_m, spec.surface or Flat(), track.predictions[0])
+        return np.concatenate([track.corners_px, moved_on(OUTER)])
 
     def _follow(self, view: View, track: Track) -> Detection | None:
         """Return a tracked marker where it is predicted; None when it is not there."""
-        steady = [(track.predictions[0], STEADY_PX)] if len(track.predictions) > 1 else []
-        for T_cam_marker, search_px in [*steady, *((T, TRACK_PX) for T in track.predictions)]:
-            fit = self._fit_near(view, track.marker_id, T_cam_marker, search_px)
+        low, high = track.corners_px.min(axis=0), track.corners_px.max(axis=0)
+        inside = low.min() > STEADY_PX and (high < np.array(view.gray.shape[::-1]) - STEADY_PX).all()
+        edges = OUTER_EDGES if inside else ALL_EDGES
+        steady = [(track.predictions[0], STEADY_PX, edges)] if len(track.predictions) > 1 else []
+        for T_cam_marker, search_px, edges in [*steady, *((T, TRACK_PX, ALL_EDGES) for T in track.predictions)]:
+            fit = self._fit_near(view, track.marker_id, T_cam_marker, search_px, edges)
             if fit is not None and fit.cost < COST_LIMIT:
                 detection = self.detector.describe(view, track.marker_id, fit, "tracked")
                 if detection is not None:
-                    return detection
+                    return self.detector.polished(view, self._unmirrored(view, detection, fit))
         return self._match_near(view, track)
+
+    def _unmirrored(self, view: View, detection: Detection, fit: Fit) -> Detection:
+        """Return the detection from the other planar pose once that is all but certain, and never to and fro."""
+        likelier = detection.planar_poses[:1]
+        if all(planar.T_cam_marker is detection.T_cam_marker or planar.probability < CERTAIN for planar in likelier):
+            return detection
+        return self.detector.with_other_pose(view, detection, fit)
 
     def _match_near(self, view: View, track: Track) -> Detection | None:
         """Return a tracked marker that is too small or blurred for its edges to be followed."""
         for T_cam_marker in track.predictions:
             warp = self._predicted(view, track.marker_id, T_cam_marker)
-            if layer_side_px(warp, 0) < POLISHED_PX:
+            if layer_side_px(warp, 0) < ALIGNED_POLISHED_PX:
                 detection = self.detector.match_near(view, track.marker_id, warp, "tracked")
                 if detection is not None:
                     return detection
@@ -137,13 +156,15 @@ class Tracker:
         warp = PoseWarp(view.camera, spec.side_m, spec.surface or Flat(), T_cam_marker)
         return warp if spec.surface is not None else HomographyWarp.from_points(OUTER, warp(OUTER))
 
-    def _fit_near(self, view: View, marker_id: int, T_cam_marker: Array, search_px: float) -> Fit | None:
-        """Return the fit to all edges around a predicted pose."""
-        warp = self._predicted(view, marker_id, T_cam_marker)
+    def _fit_near(
+        self, view: View, marker_id: int, T_cam_marker: Array, search_px: float, edges: NDArray[np.int64]
+    ) -> Fit | None:
+        """Return the fit to ``edges`` around a predicted pose, to all when it moved far."""
+        warp, near = self._predicted(view, marker_id, T_cam_marker), self.detector.near(marker_id)
         if isinstance(warp, HomographyWarp):
-            return grow(view.light, warp, 0)
-        fit: Fit | None = fit_edges(view.light, warp, ALL_EDGES, search_px, sharp_only=True)
-        return fit if fit is None or fit.moved_px < SETTLED_PX else settle(view.light, fit.warp)
+            return grow(view.light, warp, 0, near)
+        fit: Fit | None = fit_edges(view.light, warp, edges, search_px, near)
+        return fit if fit is None or fit.moved_px < SETTLED_PX else settle(view.light, fit.warp, near)
 
     def _search_near(self, view: View, track: Track, around: Array) -> Detection | None:
         """Return a lost marker from a search of the part of the image around the corners (4 N, 2) it should have."""

@@ -6,6 +6,7 @@ pixel.  Three are fitted to edges: a homography, a homography with a bend, and a
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Protocol, Self
@@ -24,6 +25,7 @@ Array = NDArray[np.float64]
 OUTSIDE_PX = -1e4
 """Where points behind the camera are said to be: far outside every image."""
 BEND_STEP_PX = 3.0
+_AXES = np.eye(2)[:, :, None]
 GRAZING_COSINE = 0.12
 """Print seen flatter than this (83 degrees from its normal) is not used."""
 
@@ -37,6 +39,10 @@ class FittedWarp(Protocol):
 
     def jacobian(self, template: Array) -> Array:
         """Return d pixels / d parameters (N, 2, P) at template points (N, 2)."""
+        ...
+
+    def slopes(self, template: Array, along: Array) -> Array:
+        """Return d pixels / d parameters along unit vectors (2, N): (P, N), at template points (N, 2)."""
         ...
 
     def stepped(self, delta: Array) -> Self:
@@ -93,6 +99,17 @@ class HomographyWarp:
         J[:, :, 6:8] = -p[:, :, None] * homogeneous[:, None, :2]
         return J
 
+    def slopes(self, template: Array, along: Array) -> Array:
+        """Return the derivative (8, N) along unit vectors (2, N) by the first eight entries of H."""
+        u = _normalised(template).T
+        w = self.H[:, :2] @ u + self.H[:, 2:]
+        inverse_depth = 1 / np.maximum(w[2], 1e-6)
+        a, b = along * inverse_depth
+        by_depth = -(a * w[0] + b * w[1]) * inverse_depth
+        S = np.empty((8, u.shape[1]))
+        S[0:2], S[2], S[3:5], S[5], S[6:8] = a * u, a, b * u, b, by_depth * u
+        return S
+
     def stepped(self, delta: Array) -> HomographyWarp:
         """Return H + delta."""
         return HomographyWarp((self.H.ravel() + np.append(delta, 0.0)).reshape(3, 3))
@@ -133,6 +150,11 @@ class BentWarp:
         J[:, 1, 11:14] = terms
         return J
 
+    def slopes(self, template: Array, along: Array) -> Array:
+        """Return the derivative (14, N) along unit vectors (2, N)."""
+        terms = self._terms(template).T
+        return np.concatenate([self.flat.slopes(template, along), along[0] * terms, along[1] * terms])
+
     def stepped(self, delta: Array) -> BentWarp:
         """Return both parts moved."""
         return BentWarp(self.flat.stepped(delta[:8]), self.bend + delta[8:].reshape(2, 3))
@@ -160,9 +182,22 @@ class BentWarp:
 def on_surface(surface: Surface, side_m: float, template: Array) -> tuple[Array, Array]:
     """Return the points and outward normals (3, N) in the marker frame of template points (..., 2); not to be changed.
 
-    They are kept, because the same few sets of points are projected in every frame.
+    They are kept, because the same few sets of points are projected in every frame: those of templates that cannot be
+    changed by the array itself, others by their numbers.
     """
-    return _on_surface(surface, side_m, np.asarray(template, dtype=float).tobytes())
+    if template.flags.writeable:
+        return _on_surface(surface, side_m, np.asarray(template, dtype=float).tobytes())
+    key = (surface, side_m, id(template))
+    if key not in _KEPT:
+        if len(_KEPT) >= MOST_KEPT:
+            _KEPT.clear()
+        _KEPT[key] = (template, *_on_surface(surface, side_m, np.asarray(template, dtype=float).tobytes()))
+    return _KEPT[key][1:]
+
+
+_KEPT: dict[tuple[Surface, float, int], tuple[Array, Array, Array]] = {}
+"""By the identity of a template, which is held here so that no other array can have it."""
+MOST_KEPT = 128
 
 
 @lru_cache(maxsize=64)
@@ -203,14 +238,18 @@ class PoseWarp:
 
     def jacobian(self, template: Array) -> Array:
         """Return the derivative (N, 2, 6) by a right perturbation of the pose, metres then radians."""
+        return np.stack([self.slopes(template, axis) for axis in _AXES]).transpose(2, 0, 1)
+
+    def slopes(self, template: Array, along: Array) -> Array:
+        """Return the derivative (6, N) along unit vectors (2, N)."""
         points_marker = self._marker(template)[0]
-        by_point = self.camera.projection_jacobian(self._cam(points_marker).T).transpose(1, 2, 0)
-        J = np.empty((2, 6, points_marker.shape[1]))
-        J[:, :3] = self.T_cam_marker[:3, :3].T @ by_point
+        by_point = self.camera.projection_slopes(self._cam(points_marker), along)
+        S = np.empty((6, points_marker.shape[1]))
+        np.matmul(self.T_cam_marker[:3, :3].T, by_point, out=S[:3])
         x, y, z = points_marker
-        gx, gy, gz = J[:, 0], J[:, 1], J[:, 2]
-        J[:, 3], J[:, 4], J[:, 5] = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx  # g . (theta x X)
-        return J.transpose(2, 0, 1)
+        gx, gy, gz = S[:3]
+        S[3], S[4], S[5] = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx  # g . (theta x X)
+        return S
 
     def stepped(self, delta: Array) -> PoseWarp:
         """Return the pose perturbed."""
@@ -219,8 +258,9 @@ class PoseWarp:
     def visible(self, template: Array) -> NDArray[np.bool_]:
         """Return which points face the camera by more than a grazing angle."""
         if not self.curved:
-            facing = -(self.T_cam_marker[:3, 3] @ self.T_cam_marker[:3, 2])  # distance from the plane
-            return np.full(len(template), facing > GRAZING_COSINE * np.linalg.norm(self.T_cam_marker[:3, 3]))
+            t = self.T_cam_marker[:3, 3]
+            facing = -float(t @ self.T_cam_marker[:3, 2])  # distance from the plane
+            return np.full(len(template), facing > GRAZING_COSINE * math.sqrt(t @ t))
         points_marker, normals_marker = self._marker(template)
         points_cam = self._cam(points_marker)
         towards = -(points_cam * (self.T_cam_marker[:3, :3] @ normals_marker)).sum(axis=0)

@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -44,7 +44,7 @@ class Stopwatch:
     """CPU seconds of this process by stage."""
 
     def __init__(self) -> None:
-        self.cpu_s: Counter[str] = Counter()
+        self.cpu_s: defaultdict[str, float] = defaultdict(float)
 
     def clocked(self, stage: str, work: Any) -> Any:
         """Call ``work`` and charge it to ``stage``."""
@@ -69,6 +69,9 @@ class _ClockedStep:
 
     def step(self, message: AnyMessage) -> Iterable[AnyMessage]:
         return self._watch.clocked(self._name, lambda: list(self._step.step(message)))
+
+    def refused(self, t_capture_ns: int) -> Iterable[AnyMessage]:
+        return self._watch.clocked(self._name, lambda: list(self._step.refused(t_capture_ns)))
 
 
 class _ClockedSink:

@@ -172,6 +172,12 @@ def _marker(parser: argparse.ArgumentParser) -> None:
         help="astratag20, astratag48h16, astratag48h12, astratag48h9 or a dictionary's JSON (default: %(default)s)",
     )
     parser.add_argument("--side-mm", type=_positive, default=100.0, metavar="S", help="outer square (%(default)s mm)")
+    variant = parser.add_argument_group("another geometry", "to print and study; the detector reads the published one")
+    variant.add_argument("--contraction", type=_positive, metavar="X", help="of the triangles (default: 4/7)")
+    variant.add_argument(
+        "--border", type=_positive, metavar="X", help="of the outermost frame, in sides (default: 1/35)"
+    )
+    variant.add_argument("--layers", type=int, metavar="N", help="copies of the pattern (default: 3)")
     parser.add_argument("--format", choices=("svg", "pdf", "png"), default="svg", help="default: %(default)s")
     parser.add_argument("--out", type=Path, default=Path("out/markers"), help="folder (default: %(default)s)")
 

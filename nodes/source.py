@@ -143,12 +143,14 @@ class SourceNode:
                 if resume is None:
                     shift_ns = time.time_ns() - stamp.t_capture_ns
                 elif stamp.sequence < resume.sequence:
+                    self._turn(0.0)
                     continue
                 else:
                     shift_ns = resume.t_capture_ns - stamp.t_capture_ns
             t_live_ns = stamp.t_capture_ns + shift_ns
             wait_ns = t_live_ns - time.time_ns()
             if wait_ns < -OVERDUE_NS:
+                self._turn(0.0)
                 continue
             self._wait_until(time.monotonic() + wait_ns / NS_PER_S)
             if self._stop.is_set():

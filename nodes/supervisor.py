@@ -2,7 +2,7 @@
 
 Replay: the run is over when every node has ended.  A required node that dies ends it with an error.
 Live: the run is over when the source has ended, the time is up or the user stops it.  A node that dies is
-started again at once while the others go on.
+started again at once while the others go on; so is one that hangs, once it has been silent for ten seconds.
 """
 
 from __future__ import annotations
@@ -30,6 +30,10 @@ FINISH_PATIENCE_S = 15.0
 """For recorder and viewer to finish their files."""
 HANG_PATIENCE_S = 1.0
 """For a process that is there and has left the bus: it is ending, or it hangs."""
+SILENCE_PATIENCE_S = 10.0
+"""For a live node to say how it is, which it does every second: Zenoh's own threads go on when its work hangs."""
+LONGEST_TURN_S = 0.5
+"""What of a turn counts as listening: when this process was stopped itself, nobody was silent."""
 MOST_RESTARTS = 5
 RESTART_MEMORY_S = 30.0
 ERROR_PREFIX = "relnav: error: "
@@ -88,6 +92,8 @@ class Child:
     """When the one before it died, until it has announced itself."""
     lapsed_s: float | None = None
     """When it left the bus."""
+    silent_s: float = 0.0
+    """How long it has not been heard since it announced itself."""
     hung: bool = False
     ended: bool = False
     lines: deque[str] = field(default_factory=lambda: deque(maxlen=50))
@@ -124,6 +130,7 @@ class Supervisor:
         self._live_since_s: float | None = None
         self._died: set[str] = set()
         self._excuse_due_s = 0.0
+        self._turned_s = time.monotonic()
         self._notes: dict[str, str] = {}
 
     def run(self) -> Outcome:
@@ -191,22 +198,32 @@ class Supervisor:
 
     def _turn(self, bus: Bus) -> None:
         event = bus.mailbox.get(POLL_S)
+        self._listen()
         match event:
             case Received():
                 self._show(event)
             case Presence(node=name, alive=True) if name in self._children:
                 self._welcome(self._children[name])
-            case Presence(node=name, alive=False) if name in self._children:
-                self._children[name].lapsed_s = time.monotonic()
+            case Presence(node=name, alive=False) if name in self._children and self._children[name].alive:
+                self._children[name].lapsed_s = time.monotonic()  # not of one just started: its predecessor left
             case Credit(node=name, ended=True) if name in self._children:
                 self._children[name].ended = True
         for child in list(self._children.values()):
-            if child.lapsed_s is not None and time.monotonic() - child.lapsed_s > HANG_PATIENCE_S:
+            lapsed = child.lapsed_s is not None and time.monotonic() - child.lapsed_s > HANG_PATIENCE_S
+            if lapsed or child.silent_s > SILENCE_PATIENCE_S:
                 child.hung = True
                 child.popen.kill()
                 child.popen.wait()
             if child.popen.poll() is not None:
                 self._mourn(child)
+
+    def _listen(self) -> None:
+        """Count the time in which live nodes could have been heard."""
+        now_s = time.monotonic()
+        listened_s, self._turned_s = min(now_s - self._turned_s, LONGEST_TURN_S), now_s
+        if not self._plan.lossless:
+            for child in self._children.values():
+                child.silent_s += listened_s if child.alive else 0.0
 
     def _show(self, received: Received) -> None:
         stamp = received.envelope.stamp
@@ -218,12 +235,16 @@ class Supervisor:
             if self._last_frame is None or stamp.sequence > self._last_frame.sequence:
                 self._last_frame = stamp
             self._hooks.on_state(stamp, message)
-        elif isinstance(message, NodeHealth) and message.note and message.note != self._notes.get(message.node):
+        if not isinstance(message, NodeHealth):
+            return
+        if message.node in self._children:
+            self._children[message.node].silent_s = 0.0
+        if message.note and message.note != self._notes.get(message.node):
             self._notes[message.node] = message.note
             self._hooks.on_note(f"warning: {message.note}")
 
     def _welcome(self, child: Child) -> None:
-        child.alive, child.lapsed_s = True, None
+        child.alive, child.lapsed_s, child.silent_s = True, None, 0.0
         if child.died_s is not None:
             self._hooks.on_note(f"{child.process.name} is back after {time.monotonic() - child.died_s:.1f} s")
             child.died_s = None

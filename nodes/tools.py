@@ -48,11 +48,16 @@ def marker(args: argparse.Namespace) -> None:
     """Write the artwork of markers and list the files."""
     from astratag.artwork import write_artwork
     from astratag.dictionary import load_dictionary
+    from astratag.geometry import MarkerGeometry
 
     dictionary = load_dictionary(args.family, ids=sorted(set(args.ids)))
+    asked = {name: getattr(args, name) for name in ("contraction", "border", "layers")}
+    changed = {name: value for name, value in asked.items() if value is not None}
+    geometry = MarkerGeometry(**changed)
+    variant = "".join(f"_{name}{value:.4g}" for name, value in changed.items())
     for marker_id in dictionary.ids:
-        path = args.out / f"{dictionary.family}_{marker_id:02d}_{args.side_mm:g}mm.{args.format}"
-        print(write_artwork(dictionary, marker_id, path, side_m=args.side_mm / 1000.0))
+        path = args.out / f"{dictionary.family}_{marker_id:02d}_{args.side_mm:g}mm{variant}.{args.format}"
+        print(write_artwork(dictionary, marker_id, path, side_m=args.side_mm / 1000.0, geometry=geometry))
 
 
 def dictionary(args: argparse.Namespace) -> None:

@@ -5,6 +5,8 @@ The motion is ``pipeline.scenario``'s; there are no pictures, corners come from 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +22,7 @@ from schemas import Detection, Detections, LayerCorners, PlanarPose
 
 Array = NDArray[np.float64]
 
-CAMERA = Camera([[1000.0, 0, 639.5], [0, 1000.0, 359.5], [0, 0, 1]], width=1280, height=720)
+CAMERA = Camera(np.array([[1000.0, 0, 639.5], [0, 1000.0, 359.5], [0, 0, 1]]), width=1280, height=720)
 T0_NS = 1_750_000_000_000_000_000
 SMALLEST_SIDE_PX = 12.0
 
@@ -28,7 +30,7 @@ CYLINDER = CylinderSection(radius_m=0.15, axis_rad=float(np.pi / 2))
 MARKER = 19
 
 
-def mission(surface: FlatSection | CylinderSection = CYLINDER, side_m: float = 0.1, **kwargs: object) -> Mission:
+def mission(surface: FlatSection | CylinderSection = CYLINDER, side_m: float = 0.1, **kwargs: Any) -> Mission:
     """Return a mission with one marker away from the target's origin and a camera away from the chaser's."""
     chaser_cam = PoseSection(translation_m=(0.05, -0.02, 0.10), rotation_wxyz=(0.5, 0.5, 0.5, 0.5))
     target_marker = PoseSection(translation_m=(0.02, 0.03, 0.15))
@@ -39,7 +41,7 @@ def mission(surface: FlatSection | CylinderSection = CYLINDER, side_m: float = 0
     )
 
 
-def approach(seed: int, **kwargs: object) -> Approach:
+def approach(seed: int, **kwargs: Any) -> Approach:
     """Return an approach whose sway and tumble begin anywhere in their periods."""
     phases = np.random.default_rng(seed).uniform(0, 2 * np.pi, 5).tolist()
     return Approach(sway_phase_rad=tuple(phases[:2]), tumble_phase_rad=tuple(phases[2:]), **kwargs)

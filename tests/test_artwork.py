@@ -15,7 +15,7 @@ from PIL import Image
 
 from astratag.artwork import CROP_MM, artwork_image, ink_outlines, write_artwork
 from astratag.dictionary import load_dictionary
-from astratag.geometry import LAYERS, QUIET_MARGIN, cell_polygons, layer_points, square
+from astratag.geometry import LAYERS, QUIET_MARGIN, MarkerGeometry, cell_polygons, layer_points, square
 from pipeline.texture import print_coverage
 
 DICTIONARY = load_dictionary()
@@ -96,6 +96,24 @@ def test_colour_at_each_cell_is_its_bit_by_both_fill_rules(signature):
     white = np.tile(signature, 3).astype(bool)
     assert (inside.sum(axis=0) % 2 == ~white).all()
     assert (winding == ~white).all()
+
+
+@pytest.mark.parametrize("geometry", [MarkerGeometry(), MarkerGeometry(0.7, 0.02, 4), MarkerGeometry(0.4, 0.1, 2)])
+def test_colour_at_each_cell_of_another_geometry_is_its_bit_in_every_layer(geometry):
+    template, signature = geometry.derived(), DICTIONARY.signature(19)
+    outlines = ink_outlines(signature, template)
+    centres = np.concatenate([layer_points(template.cells.mean(axis=1), layer) for layer in template.layers])
+    inside = np.array([Outline(outline).contains_points(centres) for outline in outlines])
+    assert (inside.sum(axis=0) % 2 == 1 - np.tile(signature, geometry.layers)).all()
+
+
+def test_another_geometry_is_named_on_its_sheet(tmp_path):
+    plain = write_artwork(DICTIONARY, 3, tmp_path / "plain.svg", side_m=0.1)
+    same = write_artwork(DICTIONARY, 3, tmp_path / "same.svg", side_m=0.1, geometry=MarkerGeometry(4 / 7, 1 / 35, 3))
+    other = write_artwork(DICTIONARY, 3, tmp_path / "other.svg", side_m=0.1, geometry=MarkerGeometry(layers=2))
+    assert plain.read_bytes() == same.read_bytes()
+    assert "contraction 0.5714, border 0.02857, layers 2" in other.read_text()
+    assert len(svg_outlines(other)[1]) < len(svg_outlines(plain)[1])
 
 
 def test_touching_white_cells_are_one_outline():
@@ -222,13 +240,13 @@ def test_the_same_marker_is_the_same_file(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"side_m": 0.0}, "side_m must be positive"),
-        ({"side_m": -0.1}, "side_m must be positive"),
-        ({"side_m": float("nan")}, "side_m must be positive"),
+        ({"side_m": 0.0}, "side_m must be a positive length"),
+        ({"side_m": -0.1}, "side_m must be a positive length"),
+        ({"side_m": float("nan")}, "side_m must be a positive length"),
         ({"marker_id": 20}, "marker 20 is not in dictionary 'astratag20'"),
         ({"name": "marker.bmp"}, "must be one of svg, pdf, png, got 'bmp'"),
         ({"name": "marker"}, "got 'no suffix'"),
-        ({"dpi": 0.0}, "dpi must be positive"),
+        ({"dpi": 0.0}, "dpi must be a positive number"),
         ({"side_m": 0.0005}, "use svg or pdf"),
         ({"side_m": 50.0}, "use svg or pdf"),
     ],

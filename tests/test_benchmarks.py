@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from astratag.signature import BLUR_UNITS, BLURRED_CELLS, EFFECTIVE_SHARE
 from benchmarks.detection.cost import measure_cost
-from benchmarks.detection.false_accepts import measure_false_accepts
+from benchmarks.detection.false_accepts import measure_effective_cells, measure_false_accepts
 from benchmarks.detection.figures import draw_condition, draw_cost
 from benchmarks.detection.peers import ENTRANTS, MARKERS, TRACKED, Entrant, texture
+from benchmarks.detection.profile import measure_profile
 from benchmarks.detection.recall import SIZES, measure, wilson
 from benchmarks.detection.scenes import CONDITIONS, SHEET_M, Scene, draw
 
@@ -59,10 +61,24 @@ def test_cost_of_two_frames(tmp_path):
     assert draw_cost(rows, tmp_path).stat().st_size > 0
 
 
+def test_a_profile_divides_the_time_of_a_search():
+    for row in measure_profile(1):
+        assert 0 < row["opencv_share"] < 1
+        assert {"findContours", "remap"} <= set(row["opencv_ms"])
+        assert sum(row["opencv_ms"].values()) == pytest.approx(row["opencv_share"] * row["cpu_ms"])
+
+
 def test_false_accepts_count_what_the_search_proposes():
     result = measure_false_accepts(100, None, QUICK[:1])
     assert result["candidates"] >= 100
     assert result["entrants"][0]["reports"] == 0
+
+
+def test_cells_of_texture_are_worth_what_the_detector_takes_them_for():
+    measured = measure_effective_cells(25, None)
+    assert measured["quads"] > 1000
+    for width, cells in zip(BLUR_UNITS, BLURRED_CELLS, strict=True):
+        assert measured[f"blur {width:g} units"] > 0.9 * EFFECTIVE_SHARE * cells
 
 
 @pytest.mark.parametrize(("found", "images", "low", "high"), [(0, 10, 0.0, 0.2775), (10, 10, 0.7225, 1.0)])

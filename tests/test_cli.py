@@ -170,6 +170,12 @@ def test_markers_are_written_and_listed(capsys, tmp_path):
     assert all(path.stat().st_size > 0 for path in paths)
 
 
+def test_a_marker_of_another_geometry_says_so_in_its_name(capsys, tmp_path):
+    assert main(["marker", "7", "--layers", "2", "--contraction", "0.6", "--out", str(tmp_path)]) == 0
+    assert Path(capsys.readouterr().out.strip()).name == "astratag20_07_100mm_contraction0.6_layers2.svg"
+    assert "9 layers with a border of" in refusal(capsys, "marker", "7", "--layers", "9", "--out", tmp_path)
+
+
 def test_chosen_identities_are_written_as_a_dictionary(capsys, tmp_path):
     fleet = tmp_path / "fleet.json"
     assert main(["dictionary", "astratag48h16", "--count", "20", "--out", str(fleet)]) == 0

@@ -303,12 +303,12 @@ def test_a_whole_family_does_without_regions_too(family):
     cells = family.signatures(1001) * 80.0 + 20
     cells[REGION_CELLS[[1, 5]]] = 250
     reading = family.decode(cells, most_missing=2)
-    assert reading == Reading(1001, 0, pytest.approx(1.0), 0, missing=(1, 5))
+    assert reading == Reading(1001, 0, pytest.approx(1.0), 0, missing=(1, 5), cells=36)
 
 
 @pytest.mark.parametrize("most_missing", [-1, 8])
 def test_refuses_to_do_without_all_regions(most_missing):
-    with pytest.raises(ValueError, match=f"most_missing is a number of regions, 0 to 7, got {most_missing}"):
+    with pytest.raises(ValueError, match=f"most_missing must be a .*number.*, got {most_missing}"):
         load_dictionary().decode(np.arange(48.0), most_missing=most_missing)
 
 
@@ -428,7 +428,7 @@ def test_how_many_wrong_cells_may_be_forgiven():
     ],
 )
 def test_refuses_rates_and_counts_that_are_none(call):
-    with pytest.raises(ValueError, match=r"at least one|in \(0, 1\)"):
+    with pytest.raises(ValueError, match=r"1 or more|in \(0, 1\)|finite"):
         call()
 
 

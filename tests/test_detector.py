@@ -12,12 +12,15 @@ from astratag import Camera, Cylinder, Detection, Detector, Flat, MarkerSpec, Su
 from astratag.geometry import LAYERS, square
 from astratag.transforms import difference, exp_so3, pose
 from astratag.warp import PoseWarp
+from benchmarks.detection.peers import texture
+from benchmarks.detection.scenes import SIDE_M, LightChange, Scene, covered, draw, glare, shadow
 from pipeline.render import render_marker
 
 DICTIONARY = load_dictionary()
 CAMERA = Camera([[1000, 0, 639.5], [0, 1000, 359.5], [0, 0, 1]], width=1280, height=720)
 CYLINDER = Cylinder(0.15)
 FACING = np.diag([1.0, -1.0, -1.0])
+TEXTURE = texture("AstraTag", 19, "equal")
 
 
 def photograph(
@@ -95,7 +98,7 @@ def test_a_print_on_an_undescribed_cylinder_is_read_and_its_grid_follows_it() ->
     """Radius 1.5 sides seen at 45 degrees, surface unknown."""
     T = pose(FACING @ exp_so3([0.8, 0.0, 0.0]), [0.0, 0.0, 0.6])
     seen = one(Detector().detect(photograph(T, CYLINDER)))
-    assert seen.method == "tps"
+    assert seen.method == "cylinder" and seen.surface is None
     span = np.linspace(0, 700, 9)
     truth = PoseWarp(CAMERA, 0.1, CYLINDER, T)(np.stack(np.meshgrid(span, span), axis=-1))
     assert seen.warp_grid_px.shape == (9, 9, 2)
@@ -153,6 +156,36 @@ def test_a_contrast_of_15_grey_levels_is_enough() -> None:
         faint = 100 + (image.astype(float) - 128) * (15 / 181)
         faint += np.random.default_rng(seed).normal(size=faint.shape)
         assert_seen_right(np.clip(np.round(faint), 0, 255).astype(np.uint8), T, Flat())
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("change", [glare(0.2), shadow(0.33), shadow(0.5)], ids=["glare", "shadow", "half in shadow"])
+def test_uneven_light_is_read_through_and_no_corner_is_further_off_than_it_says(change: LightChange, seed: int) -> None:
+    drawn = draw(Scene(side_px=120, change=change), 100 + 2 * seed)
+    image = drawn.photograph(TEXTURE)
+    seen = one(Detector(side_m=SIDE_M, surface=Flat()).detect(image, drawn.camera))
+    warp = PoseWarp(drawn.camera, SIDE_M, Flat(), drawn.T_cam_print)
+    assert np.abs(seen.corners_px - warp(square(0.0, 700.0))).max() < 1.0
+    for layer in seen.layers:
+        assert np.abs(layer.corners_px - warp(square(*LAYERS[layer.layer].black))).max() < 4 * layer.sigma_px
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("surface", [Flat(), None], ids=["flat", "unknown"])
+def test_the_edge_of_a_covering_is_not_taken_for_the_markers(surface: Surface | None, seed: int) -> None:
+    """A strip ends two pixels from an inner square's side: only what is in view is measured, the rest predicted."""
+    drawn = draw(Scene(side_px=160, change=covered(0.3)), 200 + seed)
+    seen = one(Detector(side_m=SIDE_M, surface=surface).detect(drawn.photograph(TEXTURE), drawn.camera))
+    warp = PoseWarp(drawn.camera, SIDE_M, Flat(), drawn.T_cam_print)
+    assert [layer.layer for layer in seen.layers] == [2]
+    assert np.abs(seen.corners_px - warp(square(0.0, 700.0))).max() < 0.5
+    assert np.abs(seen.layers[0].corners_px - warp(square(*LAYERS[2].black))).max() < 4 * seen.layers[0].sigma_px
+
+
+@pytest.mark.parametrize("blur_px", [3.5, 4.5])
+def test_strong_blur_is_read_as_blurred(blur_px: float) -> None:
+    seen = [Detector(side_m=SIDE_M).detect(draw(Scene(blur_px=blur_px), seed).photograph(TEXTURE)) for seed in range(4)]
+    assert sum([s.marker_id for s in found] == [19] for found in seen) >= 3
 
 
 def test_with_one_side_covered_nothing_is_reported_wrong() -> None:
@@ -239,6 +272,20 @@ def test_impossible_detectors_are_refused() -> None:
         Detector(markers={77: MarkerSpec(0.1)})
     with pytest.raises(ValueError, match="transfer"):
         Detector(transfer="gamma")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="false_accept_rate"):
+        Detector(false_accept_rate=0.0)
+    with pytest.raises(ValueError, match="tau_hamming"):
+        Detector(tau_hamming=48)
+
+
+def test_the_papers_hard_thresholds_decide_instead_of_correlation() -> None:
+    """Under noise that makes a few cells wrong, none may be with a threshold of 0."""
+    drawn = draw(Scene(side_px=80, blur_px=1.5), 7)
+    image = drawn.photograph(TEXTURE)
+    wrong = one(Detector().detect(image)).hamming
+    assert wrong > 0
+    assert one(Detector(tau_hamming=wrong).detect(image)).hamming <= wrong
+    assert Detector(tau_hamming=0).detect(image) == []
 
 
 REAL_LAYERS = {"0000": 0, "0043": 0, "0056": 1, "0083": 0, "0086": 0}

@@ -12,13 +12,17 @@ from astratag.geometry import (
     CELLS,
     DRAWN_OFFSET,
     LAYERS,
+    PUBLISHED,
+    PUBLISHED_GEOMETRY,
     REGIONS,
     SPIDRON,
     TEMPLATE_UNITS,
     TURN_CLOCKWISE,
+    MarkerGeometry,
     cell_polygons,
     layer_corners_print,
     layer_points,
+    midpoint_square,
     print_from_template,
     square,
     turn_clockwise,
@@ -117,3 +121,69 @@ def test_layer_sides_of_a_hundred_millimetre_marker(layer, side_mm):
     """The inner squares are a unit smaller than the pattern pasted there: the frame covers its first unit."""
     corners_mm = 1000 * layer_corners_print(layer, side_m=0.1)
     np.testing.assert_allclose(np.linalg.norm(np.roll(corners_mm, -1, axis=0) - corners_mm, axis=1), side_mm)
+
+
+geometries = st.builds(
+    lambda contraction, border, layers: MarkerGeometry(contraction, border / max(layers - 1, 1), layers),
+    contraction=st.floats(0.05, 0.95),
+    border=st.floats(0.001, 0.19),
+    layers=st.integers(1, 6),
+)
+
+
+def test_midpoint_squares_follow_the_nesting_law():
+    """Equation 3 of the paper: sides fall by the root of two, areas by two."""
+    for level in range(6):
+        corners = midpoint_square(level)
+        sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
+        np.testing.assert_allclose(sides, TEMPLATE_UNITS * 2 ** (-level / 2))
+        np.testing.assert_allclose(corners.mean(axis=0), TEMPLATE_UNITS / 2)
+
+
+def test_the_published_marker_follows_from_its_parameters_but_for_its_rounding():
+    """Vertices and middles of sides exactly; centroids to 5/3, 4 and 19/3 units; squares and frames to one unit."""
+    for derived, published in zip(PUBLISHED_GEOMETRY.regions(), SPIDRON, strict=True):
+        np.testing.assert_allclose(
+            [derived.a, derived.b, derived.c], [published.a, published.b, published.c], atol=1e-9
+        )
+        off = np.subtract(derived.centroid, published.centroid)
+        expected = {115.0: 5 / 3, 346.0: 4.0, 577.0: 19 / 3}
+        np.testing.assert_allclose(off, [expected[v] for v in published.centroid])
+    derived = PUBLISHED_GEOMETRY.derived()
+    assert PUBLISHED_GEOMETRY.template() is PUBLISHED
+    for exact, drawn in zip(derived.layers, PUBLISHED.layers, strict=True):
+        assert exact.scale == pytest.approx(drawn.scale)
+        assert exact.frame_corner_radius == pytest.approx(drawn.frame_corner_radius)
+        np.testing.assert_allclose(exact.black, drawn.black, atol=1.0)
+        np.testing.assert_allclose(exact.origin, drawn.origin, atol=0.5)
+        assert (exact.frame is None) == (drawn.frame is None)
+        if exact.frame is not None:
+            np.testing.assert_allclose(exact.frame, drawn.frame, atol=1.0)
+    assert np.abs(derived.cells + DRAWN_OFFSET - PUBLISHED.cells).max() == pytest.approx(19 / 3)
+
+
+@given(geometries)
+def test_every_geometry_turns_as_the_published_one(geometry):
+    """The permutation of the cells belongs to the construction: with true centroids it is exact."""
+    cells = geometry.derived().cells
+    turned = turned_on_the_template(cells)[np.argsort(TURN_CLOCKWISE)]
+    for there, cell in zip(turned, cells, strict=True):
+        np.testing.assert_allclose(sorted(there.round(6).tolist()), sorted(cell.round(6).tolist()), atol=1e-5)
+
+
+@given(geometries)
+def test_nothing_touches_in_any_geometry(geometry):
+    """Cells keep off the edge of their black square, off other regions and off the frame of the layer inside."""
+    template = geometry.derived()
+    regions = template.cells.reshape(REGIONS, -1, 2)
+    room = TEMPLATE_UNITS / 6 * (1 - geometry.contraction)
+    assert regions.min() == pytest.approx(room) and regions.max() == pytest.approx(TEMPLATE_UNITS - room)
+    corner, edge = regions[0], regions[4]  # top left and left, either side of the line x + y = 350
+    assert corner.sum(axis=1).max() < TEMPLATE_UNITS / 2 < edge.sum(axis=1).min()
+    for outer, inner in pairwise(template.layers):
+        cells = layer_points(template.cells, outer)
+        near, far = inner.frame
+        assert outer.black[0] < near < inner.black[0] < inner.black[1] < far < outer.black[1]
+        assert inner.black[0] - near == pytest.approx(geometry.border * TEMPLATE_UNITS / 2 ** (inner.index - 1))
+        assert not ((cells > near) & (cells < far)).all(axis=-1).any()
+        np.testing.assert_allclose(layer_points(square(0, TEMPLATE_UNITS), inner), square(*inner.black))

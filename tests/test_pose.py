@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from astratag.camera import Camera
 from astratag.detection import LayerDetection
 from astratag.geometry import LAYERS, square
-from astratag.pose import planar_poses, poses_from_square, refine_on_corners
+from astratag.pose import mirrored, planar_poses, poses_from_square, refine_on_corners
 from astratag.surface import Cylinder, Flat, Surface
 from astratag.transforms import difference, exp_so3, pose
 from astratag.warp import PoseWarp
@@ -77,3 +77,33 @@ def test_covariance_is_consistent(surface: str, seed: int) -> None:
         nees.append(error @ np.linalg.solve(found.covariance, error))
     low, high = chi2.ppf([0.0005, 0.9995], 6 * draws) / draws
     assert 0.8 * low < np.mean(nees) < high
+
+
+@pytest.mark.parametrize("tilt_rad", [0.1, 0.2, 0.35])
+def test_probabilities_of_the_two_poses_are_what_they_claim(tilt_rad: float) -> None:
+    """Of draws with the noise that is claimed, the true pose comes first as often as its probability says."""
+    rng, sigma_px = np.random.default_rng(1), 0.2
+    T = pose(FACING @ exp_so3([tilt_rad, 0.0, 0.0]), [0.0, 0.0, 1.5])
+    truth = seen_layers(T, Flat(), (0,), sigma_px)[0]
+    first, claimed = [], []
+    for _ in range(60):
+        noisy = LayerDetection(0, truth.corners_px + rng.normal(0, sigma_px, (4, 2)), sigma_px)
+        poses = planar_poses(CAMERA, [noisy], 0.1, Flat())
+        off = [np.linalg.norm(difference(T, planar.T_cam_marker)[3:]) for planar in poses]
+        first.append(off[0] == min(off))
+        claimed.append(poses[0].probability)
+        assert sum(planar.probability for planar in poses) == pytest.approx(1)
+        assert claimed[-1] >= 0.5 - 1e-9
+    assert np.mean(first) == pytest.approx(np.mean(claimed), abs=0.2)
+
+
+def test_a_fitted_pose_finds_its_mirror_image() -> None:
+    """Begun from either of the two poses, the same two are found."""
+    T = pose(FACING @ exp_so3([0.35, 0.1, 0.0]), [0.02, 0.0, 1.2])
+    layers = seen_layers(T, Flat(), (0,))
+    both = planar_poses(CAMERA, layers, 0.1, Flat())
+    again = planar_poses(CAMERA, layers, 0.1, Flat(), T)
+    for one, other in zip(both, again, strict=True):
+        np.testing.assert_allclose(difference(one.T_cam_marker, other.T_cam_marker), 0, atol=2e-3)
+    assert again[0].T_cam_marker is T
+    np.testing.assert_allclose(mirrored(mirrored(T)), T, atol=1e-12)

@@ -66,10 +66,10 @@ def test_any_leading_shape(surface):
 
 @pytest.mark.parametrize("radius_m", [0.0, -1.0, np.inf, np.nan])
 def test_refuses_a_radius_that_is_not_positive_and_finite(radius_m):
-    with pytest.raises(ValueError, match="radius_m must be positive"):
+    with pytest.raises(ValueError, match="radius_m must be a positive length"):
         Cylinder(radius_m)
 
 
 def test_refuses_an_axis_that_is_not_finite():
-    with pytest.raises(ValueError, match="axis_rad must be finite"):
+    with pytest.raises(ValueError, match="axis_rad must be a finite number"):
         Cylinder(1.0, np.nan)

@@ -11,7 +11,7 @@ import pytest
 from astratag import Camera, Cylinder, Detector, Flat, Surface, Tracker, load_dictionary
 from astratag.edges import inverse_transfer
 from astratag.geometry import square
-from astratag.matching import acceptance_of_pixels, match
+from astratag.matching import Match, acceptance_of_pixels, match, rough_matches
 from astratag.synthesis import Expected, Synthesis, _nodes, _picture, expected, look
 from astratag.transforms import difference, exp_so3, perturb, pose
 from astratag.warp import FittedWarp, HomographyWarp, PoseWarp
@@ -56,6 +56,13 @@ def light_of(image: np.ndarray) -> np.ndarray:
 
 def corners(T_cam_marker: np.ndarray, surface: Surface = FLAT) -> np.ndarray:
     return PoseWarp(CAMERA, SIDE_M, surface, T_cam_marker)(square(0.0, 700.0))
+
+
+def matched(synthesis: Synthesis, image: np.ndarray, quad: np.ndarray) -> Match | None:
+    """Return what a quad of an image is matched with, if anything."""
+    light = light_of(image)
+    rough = rough_matches(synthesis, light, quad[None], BLUR_PX)
+    return match(synthesis, light, rough[0], BLUR_PX, ACCEPT) if rough else None
 
 
 def looks(warp: FittedWarp, blur_px: float, softness: float | None = None) -> Expected:
@@ -132,7 +139,7 @@ def test_alignment_works_on_any_warp_and_tells_the_blur() -> None:
 @pytest.mark.parametrize("marker_id", [0, 7, 19])
 def test_sixteen_pixels_are_enough_to_tell_identity_and_orientation(marker_id: int) -> None:
     image = photograph(tumbled(16, 4), marker_id=marker_id)
-    found = match(SYNTHESIS, light_of(image), np.roll(corners(tumbled(16, 4)), 3, axis=0) + 0.3, 0.9, ACCEPT)
+    found = matched(SYNTHESIS, image, np.roll(corners(tumbled(16, 4)), 3, axis=0) + 0.3)
     assert found is not None
     assert (found.marker_id, found.layer) == (marker_id, 0)
     assert np.abs(found.alignment.warp(square(0.0, 700.0)) - corners(tumbled(16, 4))).max() < 0.4
@@ -146,9 +153,9 @@ def test_nothing_else_is_matched() -> None:
             image = np.full((240, 320), 200, np.uint8)
             noise = rng.integers(0, 2, (cells, cells)).astype(np.uint8) * 180 + 20
             image[100:130, 100:130] = cv2.resize(noise, (30, 30), interpolation=cv2.INTER_NEAREST)
-            assert match(SYNTHESIS, light_of(cv2.GaussianBlur(image, (0, 0), 0.8)), quad - 0.5, 0.9, ACCEPT) is None
+            assert matched(SYNTHESIS, cv2.GaussianBlur(image, (0, 0), 0.8), quad - 0.5) is None
     others = Synthesis(DICTIONARY.restricted([0, 1, 2, 3]))
-    assert match(others, light_of(photograph(tumbled(24, 1))), corners(tumbled(24, 1)), 0.9, ACCEPT) is None
+    assert matched(others, photograph(tumbled(24, 1)), corners(tumbled(24, 1))) is None
 
 
 @pytest.mark.parametrize("side_px", [14, 20, 28])

@@ -59,3 +59,12 @@ def test_points_behind_the_camera_are_outside_every_image() -> None:
 def test_the_far_side_of_a_cylinder_is_not_visible() -> None:
     tight = PoseWarp(camera(), 0.1, Cylinder(0.03), pose(np.diag([1.0, -1.0, -1.0]), [0, 0, 0.5]))
     assert tight.visible(np.array([(350.0, 350.0), (350.0, 0.0)])).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("name", WARPS)
+def test_slopes_are_the_jacobian_along_directions(name: str) -> None:
+    warp, rng = WARPS[name], np.random.default_rng(0)
+    points, angles = rng.uniform(0, 700, (20, 2)), rng.uniform(0, 2 * np.pi, 20)
+    along = np.stack([np.cos(angles), np.sin(angles)])
+    expected = np.einsum("in,nip->pn", along, warp.jacobian(points))
+    np.testing.assert_allclose(warp.slopes(points, along), expected, rtol=1e-9, atol=1e-9)

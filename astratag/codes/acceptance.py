@@ -18,12 +18,15 @@ from scipy.optimize import brentq
 from scipy.special import betainc, betaincinv
 from scipy.stats import binom
 
+from astratag.checks import finite, numbers, whole
 from astratag.geometry import CELLS
 
 FALSE_ACCEPT_RATE = 1e-6
 """The share of candidates that may be accepted by chance, unless told otherwise."""
 TAIL = 100
 """Candidates that a measured tail must hold: it is then known to a tenth."""
+MOST_CELLS = 1e4
+"""No pattern is taken for more independent cells than this."""
 
 
 def chance_of_correlation(threshold: ArrayLike, cells: ArrayLike = CELLS) -> NDArray[np.float64]:
@@ -46,10 +49,8 @@ def acceptance_threshold(
     Of chance candidates a share of at most ``false_accept_rate`` does, in (0, 1).  1.0 for too few ``cells`` to say.
     Raises ValueError for counts below one or a rate outside (0, 1).
     """
-    _check(templates, warps)
-    if not 0 < false_accept_rate < 1:
-        raise ValueError(f"false_accept_rate is a share of candidates in (0, 1), got {false_accept_rate}")
-    if cells <= 2:
+    _check(templates, warps, false_accept_rate)
+    if finite(cells, "cells") <= 2:
         return 1.0
     chance = min(false_accept_rate / (templates * warps), 0.5)
     return float(np.sqrt(1.0 - betaincinv(cells / 2 - 1, 0.5, 2 * chance)))
@@ -62,11 +63,14 @@ def effective_cells(best: ArrayLike, templates: int, warps: int = 1) -> float:
     frequent accepts are extrapolated by whoever puts the result into ``acceptance_threshold``.
     Raises ValueError for fewer than a thousand candidates.
     """
-    ordered = np.sort(np.asarray(best, dtype=float))
-    if ordered.ndim != 1 or len(ordered) < 10 * TAIL:
-        raise ValueError(f"best must be at least {10 * TAIL} correlations, one a candidate, got {ordered.shape}")
-    level, share = ordered[-TAIL], TAIL / len(ordered)
-    return float(brentq(lambda n: acceptance_threshold(templates, warps, share, n) - level, 2.0, 1e4))
+    best = numbers(best, "best")
+    if best.ndim != 1 or len(best) < 10 * TAIL:
+        raise ValueError(f"best must be at least {10 * TAIL} correlations, one a candidate, got {best.shape}")
+    level, share = np.sort(best)[-TAIL], TAIL / len(best)
+    least = acceptance_threshold(templates, warps, share, MOST_CELLS)
+    if not least < level <= 1.0:
+        raise ValueError(f"best must be correlations, {TAIL} of them above {least:.2f}, got {level:.2f} as the last")
+    return float(brentq(lambda n: acceptance_threshold(templates, warps, share, n) - level, 2.0, MOST_CELLS))
 
 
 def hamming_false_accept_rate(tau: int, templates: int, warps: int = 1, cells: int = CELLS) -> float:
@@ -76,15 +80,19 @@ def hamming_false_accept_rate(tau: int, templates: int, warps: int = 1, cells: i
     ``acceptance_threshold`` with this rate is the correlation threshold that is as strict.
     """
     _check(templates, warps)
+    whole(tau, "tau")
     return float(min(templates * warps * binom.cdf(tau, cells, 0.5), 1.0))
 
 
 def hamming_threshold(templates: int, warps: int = 1, false_accept_rate: float = FALSE_ACCEPT_RATE) -> int | None:
     """Return the most wrong cells that may be forgiven at a false-accept rate; None when not even a perfect reading."""
+    _check(templates, warps, false_accept_rate)
     allowed = [t for t in range(CELLS) if hamming_false_accept_rate(t, templates, warps) <= false_accept_rate]
     return max(allowed, default=None)
 
 
-def _check(templates: int, warps: int) -> None:
-    if templates < 1 or warps < 1:
-        raise ValueError(f"templates and warps are counts of at least one, got {templates} and {warps}")
+def _check(templates: int, warps: int, false_accept_rate: float = FALSE_ACCEPT_RATE) -> None:
+    whole(templates, "templates", 1)
+    whole(warps, "warps", 1)
+    if not 0 < finite(false_accept_rate, "false_accept_rate") < 1:
+        raise ValueError(f"false_accept_rate is a share of candidates in (0, 1), got {false_accept_rate}")

@@ -18,7 +18,7 @@ codes in S. B. Wicker and V. K. Bhargava (eds.), "Reed-Solomon Codes and Their A
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 
@@ -27,8 +27,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from astratag.codes import gf64
 from astratag.codes.algebraic import Rejected, decode_symbols
-from astratag.codes.soft import Reading, Search, decide, kept_cells, likely_words, split_level
-from astratag.codes.words import CELLS_PER_REGION, REGION_CELLS, LinearMap, Words, pack, unpack
+from astratag.codes.soft import (
+    Reading,
+    Search,
+    checked_cells,
+    decide,
+    erased_regions,
+    kept_cells,
+    likely_words,
+    split_level,
+)
+from astratag.codes.words import CELLS_PER_REGION, REGION_CELLS, LinearMap, Words, checked_bits, pack, unpack
 from astratag.geometry import CELLS, REGIONS, TURN_CLOCKWISE
 
 CHUNK = 1 << 20
@@ -92,7 +101,7 @@ class Family:
 
     def symbols(self, cells: NDArray[np.uint8]) -> gf64.Elements:
         """Return the symbols (..., 8) of cells (..., 48)."""
-        return np.bitwise_xor.reduce(cells[..., REGION_CELLS] * self.basis, axis=-1)
+        return np.bitwise_xor.reduce(checked_bits(cells)[..., REGION_CELLS] * self.basis, axis=-1)
 
     def cells(self, symbols: gf64.Elements) -> NDArray[np.uint8]:
         """Return the cells (..., 48) of symbols (..., 8)."""
@@ -166,11 +175,13 @@ class Family:
 
     def messages(self, cells: NDArray[np.uint8]) -> NDArray[np.int64]:
         """Return the messages (...) that cells (..., 48) say."""
-        return cells[..., self._message_cells] @ (1 << np.arange(self.message_bits))
+        return checked_bits(cells)[..., self._message_cells] @ (1 << np.arange(self.message_bits))
 
     def signatures(self, ids: ArrayLike) -> NDArray[np.uint8]:
         """Return the upright cells (..., 48) of ids (...).  Raises ValueError for an id outside the family."""
-        ids = np.asarray(ids)
+        ids = np.asarray(ids) if np.size(ids) else np.zeros(np.shape(ids), dtype=np.int64)
+        if ids.dtype.kind not in "iu":
+            raise ValueError(f"{self.name} has ids 0-{len(self) - 1}, got what is no array of integers")
         if ids.size and not (ids.min() >= 0 and ids.max() < len(self)):
             outside = ids.min() if ids.min() < 0 else ids.max()
             raise ValueError(f"{self.name} has ids 0-{len(self) - 1}, got {outside}")
@@ -193,7 +204,7 @@ class Family:
         Beyond that it refuses, or finds another marker that differs in as few regions: a detector that must not
         accept noise asks for more than this (see ``Family.decode``).
         """
-        kept = np.arange(REGIONS) if erased is None else np.flatnonzero(~np.asarray(erased, dtype=bool))
+        kept = np.flatnonzero(~erased_regions(erased))
         received = self.symbols(cells)
         polynomial = decode_symbols(received[kept], self.points[kept], self.k)
         if isinstance(polynomial, Rejected):
@@ -219,7 +230,7 @@ class Family:
         the codewords through every choice of k regions, which hold the right one whenever k regions read well,
         and those near the surest cells (``likely_words``).
         """
-        kept = kept_cells(cells, erased)
+        cells, kept = checked_cells(cells), kept_cells(erased)
         choices, words = self._any_k_regions
         whole = np.all(kept[REGION_CELLS], axis=1)
         if whole.sum() < self.k:
@@ -230,5 +241,6 @@ class Family:
         through = np.bitwise_xor.reduce(np.where(white.reshape(-1, self.message_bits), words[in_view], 0), axis=1)
         found = np.unique(np.concatenate([through, likely_words(cells, kept, level, self.generator)]))
         codes = unpack(found)
-        search = Search(4 * len(self), threshold, min(most_missing, REGIONS - self.k))
+        search = Search(4 * len(self), threshold, most_missing)
+        search = replace(search, most_missing=min(search.most_missing, REGIONS - self.k))
         return decide(cells, kept, codes.astype(float), lambda n: self.identify(codes[n]), search)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from astratag.checks import whole
 from astratag.codes import gf64
 from astratag.codes.family import Family
 from astratag.codes.words import CELLS_PER_REGION, span
@@ -33,6 +34,7 @@ def search_instance(k: int, seed: int) -> Family:
     The code is linear over GF(2) and holds the turns of its codewords, so the distance between any two readings
     is the weight of a codeword: counting the ones of all 2^(6 k) words gives it exactly.
     """
+    k, seed = whole(k, "k"), whole(seed, "seed")
     if k not in WANTED_DISTANCE:
         raise ValueError(f"k must be one of {sorted(WANTED_DISTANCE)}, got {k}")
     rng = np.random.default_rng(seed)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from astratag.checks import instance, whole
 from astratag.codes.family import Family
 from astratag.codes.words import pack
 from astratag.geometry import turn_clockwise
@@ -21,9 +22,11 @@ def select_identities(family: Family, count: int, seed: int = 0) -> tuple[int, .
 
     Source: T. F. Gonzalez, "Clustering to minimize the maximum intercluster distance", 1985.
     """
+    instance(family, Family, "family", "astratag.codes.FAMILIES has them by name")
+    count = whole(count, "count")
     if not 0 < count <= len(family):
         raise ValueError(f"count must be in 1-{len(family)}, the identities of {family.name}, got {count}")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(whole(seed, "seed"))
     pool = np.arange(len(family))
     if len(pool) > LARGEST_POOL:
         pool = np.sort(rng.choice(pool, max(LARGEST_POOL, count), replace=False))

@@ -13,6 +13,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from astratag.checks import finite, numbers, whole
 from astratag.codes.acceptance import acceptance_threshold, chance_of_correlation
 from astratag.codes.algebraic import Rejected
 from astratag.codes.words import REGION_CELLS, Words
@@ -42,44 +43,51 @@ class Reading:
     hamming: int
     missing: tuple[int, ...] = ()
     """Regions of the image that were left out because the rest fits far better without them."""
+    cells: int = CELLS
+    """How many cells the correlation is worth: those that are seen and count, and fewer when blur makes codes alike."""
 
 
-def kept_cells(cells: Array, erased: ArrayLike | None) -> Kept:
-    """Return which cells (48,) count when some regions are ``erased`` (8,).
+def checked_cells(cells: ArrayLike) -> Array:
+    """Return brightnesses (48,) the largest scaled to 1.  Raises ValueError for what ``decode`` cannot take."""
+    values = numbers(cells, "cells")
+    if values.shape != (CELLS,):
+        raise ValueError(f"cells must be {CELLS} finite brightnesses, got shape {values.shape}: one code at a time")
+    return values / max(np.abs(values).max(), np.finfo(float).tiny)
 
-    Raises ValueError when ``cells`` or ``erased`` are not what ``decode`` takes.
-    """
-    if np.shape(cells) != (CELLS,) or not np.isfinite(cells).all():
-        raise ValueError(f"cells must be {CELLS} finite brightnesses, got shape {np.shape(cells)}: one code at a time")
+
+def erased_regions(erased: ArrayLike | None) -> Kept:
+    """Return which regions (8,) are erased.  Raises ValueError for what are not eight booleans."""
+    flags = np.zeros(REGIONS, dtype=bool) if erased is None else np.asarray(erased)
+    if flags.shape != (REGIONS,) or flags.dtype != bool:
+        raise ValueError(f"erased must be {REGIONS} booleans, one a region, got {flags.dtype} {flags.shape}")
+    return flags
+
+
+def kept_cells(erased: ArrayLike | None) -> Kept:
+    """Return which cells (48,) count when some regions are ``erased`` (8,).  Raises as ``erased_regions`` does."""
     kept = np.ones(CELLS, dtype=bool)
-    if erased is not None:
-        flags = np.asarray(erased)
-        if flags.shape != (REGIONS,) or flags.dtype != bool:
-            raise ValueError(f"erased must be {REGIONS} booleans, one a region, got {flags.dtype} {flags.shape}")
-        kept[REGION_CELLS[flags]] = False
+    kept[REGION_CELLS[erased_regions(erased)]] = False
     return kept
 
 
 def correlations(cells: Array, kept: Kept, codes: NDArray) -> Array:
-    """Return the correlation (S, N) of cells (48,) with codes (N, 48) of ones and zeros over S sets (S, 48) of cells.
+    """Return the correlation (S, N) of cells (48,) or (S, 48) with codes (N, 48) over S sets (S, 48) of cells.
 
     Zero where the cells or a code show no contrast there.
     """
-    n = kept.sum(axis=1, keepdims=True)
+    n = np.maximum(kept.sum(axis=1, keepdims=True), 1)
     centred = np.where(kept, cells - (kept * cells).sum(axis=1, keepdims=True) / n, 0.0)
     length = np.linalg.norm(centred, axis=1, keepdims=True)
-    unit = centred / np.where(length > LEAST_CONTRAST * np.abs(cells).max(), length, np.inf)
+    unit = centred / np.where(length > LEAST_CONTRAST * np.abs(cells).max(axis=-1, keepdims=True), length, np.inf)
     ones = kept.astype(float) @ codes.T
-    spread = np.sqrt(ones * (n - ones) / n)  # length of a code with its mean removed
+    spread = np.sqrt(ones * (n - ones) / n)  # length of a code of ones and zeros with its mean removed
     return (unit @ codes.T) / np.where(spread > 0, spread, np.inf)
 
 
 def with_regions_missing(kept: Kept, most_missing: int) -> tuple[list[tuple[int, ...]], Kept]:
     """Return the choices of up to so many of the whole regions left, and the cells (S, 48) that each leaves."""
-    if not 0 <= most_missing < REGIONS:
-        raise ValueError(f"most_missing is a number of regions, 0 to {REGIONS - 1}, got {most_missing}")
-    whole = np.flatnonzero(kept[REGION_CELLS].all(axis=1)).tolist()
-    choices = [c for m in range(min(most_missing, len(whole) - 1) + 1) for c in combinations(whole, m)]
+    in_view = np.flatnonzero(kept[REGION_CELLS].all(axis=1)).tolist()
+    choices = [c for m in range(min(most_missing, len(in_view) - 1) + 1) for c in combinations(in_view, m)]
     left = np.repeat(kept[None], len(choices), axis=0)
     for row, choice in enumerate(choices):
         left[row, REGION_CELLS[list(choice)]] = False
@@ -100,6 +108,13 @@ class Search:
     readings: int
     threshold: float | None
     most_missing: int
+
+    def __post_init__(self) -> None:
+        if self.threshold is not None:
+            finite(self.threshold, "threshold")
+        object.__setattr__(self, "most_missing", whole(self.most_missing, "most_missing"))
+        if self.most_missing >= REGIONS:
+            raise ValueError(f"most_missing must be a number of regions, 0 to {REGIONS - 1}, got {self.most_missing}")
 
 
 def decide(
@@ -135,7 +150,7 @@ def decide(
     if identity is None:
         return Rejected("the best codeword looks the same after half a turn and is nobody's")
     wrong = hamming(cells, left[surest], codes[code].astype(np.uint8))
-    return Reading(*identity, float(score[surest]), wrong, choices[surest])
+    return Reading(*identity, float(score[surest]), wrong, choices[surest], int(count[surest]))
 
 
 def split_level(values: Array) -> float:

@@ -28,6 +28,14 @@ REGION_CELLS = _region_cells()
 """Cells (8, 6) of the regions TL, TR, BR, BL, L, T, R, B in the order in which they carry a symbol's bits."""
 
 
+def checked_bits(cells: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return cells (..., 48).  Raises ValueError for another number of them, or what are not zeros and ones."""
+    bits = np.asarray(cells)
+    if bits.shape[-1:] != (CELLS,) or bits.dtype.kind not in "biu" or (bits > 1).any() or (bits < 0).any():
+        raise ValueError(f"cells must be {CELLS} zeros and ones, got {bits.dtype} of shape {bits.shape}")
+    return bits
+
+
 def pack(cells: NDArray[np.uint8]) -> Words:
     """Return cells (..., 48), 0 or 1, as words (...): bit c of a word is cell c."""
     octets = np.packbits(cells, axis=-1, bitorder="little")

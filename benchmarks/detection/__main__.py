@@ -29,11 +29,12 @@ from benchmarks.detection.cost import measure_cost
 from benchmarks.detection.false_accepts import FIRST_SEED, measure_false_accepts
 from benchmarks.detection.figures import draw_condition, draw_cost, rows_of
 from benchmarks.detection.peers import ENTRANTS, TRACKED, Entrant
+from benchmarks.detection.profile import measure_profile
 from benchmarks.detection.recall import SIZES, measure
 from benchmarks.detection.scenes import CONDITIONS, Condition
 
 REAL_FRAMES = Path(__file__).resolve().parents[3] / "shared" / "reference" / "frames"
-PARTS = (*(condition.name for condition in CONDITIONS), "cost", "false-accepts")
+PARTS = (*(condition.name for condition in CONDITIONS), "cost", "profile", "false-accepts")
 CONSOLE = Console(width=200)
 
 
@@ -99,6 +100,21 @@ def show_cost(rows: Sequence[dict]) -> None:
     CONSOLE.print(table)
 
 
+def show_profile(rows: Sequence[dict]) -> None:
+    """Print how a search's CPU time divides between OpenCV, which a native core would keep, and all around it."""
+    table = Table(
+        title="A search, CPU ms: OpenCV's own, and the Python and NumPy around it", title_justify="left", box=None
+    )
+    for heading in ("", "all", "OpenCV", "around it", "most of OpenCV's"):
+        table.add_column(heading)
+    for row in rows:
+        opencv = row["opencv_share"] * row["cpu_ms"]
+        most = ", ".join(f"{name} {ms:.2f}" for name, ms in list(row["opencv_ms"].items())[:4])
+        around = f"{row['cpu_ms'] - opencv:.2f} ({1 - row['opencv_share']:.0%})"
+        table.add_row(row["image"], f"{row['cpu_ms']:.2f}", f"{opencv:.2f} ({row['opencv_share']:.0%})", around, most)
+    CONSOLE.print(table)
+
+
 def show_false_accepts(result: dict) -> None:
     """Print who saw markers where there were none."""
     CONSOLE.print(
@@ -139,6 +155,9 @@ def main() -> None:
         results["cost"] = cost = measure_cost(options.images, (*entrants, TRACKED))
         show_cost(cost)
         draw_cost(cost, options.out)
+    if "profile" in parts:
+        results["profile"] = profile = measure_profile(options.images)
+        show_profile(profile)
     results["recall"] = measured = []
     for condition, rows in recall(conditions, options.images, options.processes, entrants):
         show_condition(condition, rows, entrants)

@@ -9,6 +9,7 @@ enlarged, mirrored, inverted, its contrast changed, with noise.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -16,8 +17,13 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag import Detector
-from astratag.search import find_quads
+from astratag import Detector, load_dictionary
+from astratag.candidates import LEAST_RELIT_SIDE_PX, looks_large, points_in
+from astratag.codes import acceptance_threshold, effective_cells
+from astratag.edges import inverse_transfer
+from astratag.relight import RELIT_SAMPLES, relit_cells
+from astratag.search import BROAD, FAINT, NARROW, PLAIN, find_quads
+from astratag.signature import BLUR_UNITS, EFFECTIVE_SHARE, LEAST_SEEN, SAMPLES, Codebook, cell_values, unit
 from benchmarks.detection.peers import ENTRANTS, Entrant
 from benchmarks.detection.recall import wilson
 from benchmarks.detection.scenes import Scene, draw
@@ -34,7 +40,8 @@ def textures(folder: Path | None) -> dict[str, Picture]:
     sample = Path(matplotlib.get_data_path()) / "sample_data" / "grace_hopper.jpg"
     paths = [path for path in (sample, *sorted(folder.iterdir() if folder else ())) if path.suffix.lower() in SUFFIXES]
     pictures = {path.name: cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in paths if path.exists()}
-    return {name: painted_over(picture) for name, picture in pictures.items()} | {"made": made_texture()}
+    read = {name: painted_over(picture) for name, picture in pictures.items() if picture is not None}
+    return read | {"made": made_texture()}
 
 
 def painted_over(picture: Picture) -> Picture:
@@ -74,6 +81,33 @@ def pieces(sources: list[Picture]) -> Iterator[tuple[int, Picture]]:
         piece = 255 * (piece / 255) ** np.exp(rng.uniform(-0.5, 0.5)) * rng.choice([-1, 1])
         piece = piece % 255.0 + rng.uniform(0, 4) * rng.standard_normal(piece.shape)
         yield seed, np.clip(np.round(piece), 0, 255).astype(np.uint8)
+
+
+def measure_effective_cells(pictures: int, folder: Path | None) -> dict[str, float]:
+    """Return what a cell of real texture is worth: ``effective_cells`` of all quads found, by how blurred the code is.
+
+    The parents of ``EFFECTIVE_SHARE`` and ``BLURRED_CELLS``.  Of relit quads, the share that chance explains less often
+    than once in a hundred, which should be below 0.01.
+    """
+    dictionary, light_of = load_dictionary(), inverse_transfer("srgb")
+    codebook = Codebook(dictionary)
+    cells, relit = [], []
+    for _, picture in islice(pieces(list(textures(folder).values())), pictures):
+        light = cv2.LUT(picture, light_of)
+        quads = np.concatenate([find_quads(picture, how) for how in (PLAIN, NARROW, FAINT, BROAD)])
+        if len(quads):
+            cells.append(unit(cell_values(light, points_in(quads, SAMPLES))))
+        large = quads[looks_large(quads) >= LEAST_RELIT_SIDE_PX]
+        if len(large):
+            readings = codebook.read_seen(*relit_cells(light, points_in(large, RELIT_SAMPLES)))
+            relit += [reading for reading in readings if reading.cells >= LEAST_SEEN]
+    templates = 4 * len(dictionary)
+    found = {
+        f"blur {width:g} units": effective_cells((np.concatenate(cells) @ codes.T).max(axis=1), templates)
+        for width, codes in zip(BLUR_UNITS, codebook.unit_codes, strict=True)
+    }
+    above = [r.correlation > acceptance_threshold(templates, 1, 0.01, EFFECTIVE_SHARE * r.cells) for r in relit]
+    return {"quads": float(sum(map(len, cells))), **found, "relit above 1 %": float(np.mean(above or 0.0))}
 
 
 def measure_false_accepts(

@@ -84,7 +84,7 @@ class Entrant:
 
 def blown_up(cells: NDArray[np.uint8], margin: int = 0) -> Raster:
     """Return a picture of one texel a cell with a white margin of cells, enlarged exactly."""
-    return np.kron(np.pad(cells, margin, constant_values=255), np.ones((CELL_TEXELS, CELL_TEXELS), np.uint8))
+    return np.pad(cells, margin, constant_values=255).repeat(CELL_TEXELS, axis=0).repeat(CELL_TEXELS, axis=1)
 
 
 def draw_apriltag(family: str, tag_id: int) -> Raster:
@@ -159,7 +159,7 @@ def apriltag_detector(family: str) -> Any:
     """
     from pyapriltags import Detector as AprilTagDetector
 
-    detector = AprilTagDetector(families="", nthreads=1)
+    detector: Any = AprilTagDetector(families="", nthreads=1)
     detector.tag_families[family] = codes = getattr(detector.libc, f"{family}_create")()
     codes.contents.ncodes = APRILTAG_IDS
     detector.libc.apriltag_detector_add_family_bits(detector.tag_detector_ptr, codes, 2)
@@ -188,7 +188,9 @@ def aruco() -> Reader:
     def read(image: Raster, _: Camera) -> list[Seen]:
         corners, ids, _rejected = detector.detectMarkers(image)
         return (
-            [] if ids is None else [(int(i), np.reshape(c, (4, 2))) for i, c in zip(ids.ravel(), corners, strict=True)]
+            []
+            if ids is None
+            else [(int(i), np.reshape(c, (4, 2)).astype(float)) for i, c in zip(ids.ravel(), corners, strict=True)]
         )
 
     return read
@@ -201,7 +203,7 @@ def fractal() -> Reader:
 
     nanofractal.set_num_threads(1)
     detector = nanofractal.FractalDetector(FRACTAL)
-    return lambda image, _: [(level, corners) for level, corners in detector.detect(image)]
+    return lambda image, _: [(level, corners.astype(float)) for level, corners in detector.detect(image)]
 
 
 ENTRANTS = (

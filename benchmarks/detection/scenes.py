@@ -125,7 +125,7 @@ def draw(scene: Scene, seed: int) -> Draw:
 @lru_cache(maxsize=8)
 def pinhole(width_px: int, height_px: int, focal_px: float) -> Camera:
     """Return a camera without distortion."""
-    K = [[focal_px, 0, (width_px - 1) / 2], [0, focal_px, (height_px - 1) / 2], [0, 0, 1]]
+    K = np.array([[focal_px, 0, (width_px - 1) / 2], [0, focal_px, (height_px - 1) / 2], [0, 0, 1]])
     return Camera(K, width=width_px, height=height_px)
 
 
@@ -179,7 +179,7 @@ def covered(share: float) -> LightChange:
 
     def change(light: Image, sheet_px: Array, rng: np.random.Generator) -> Image:
         lines = 1 + round((GRID - 1) * (QUIET_MARGIN + share) / (1 + 2 * QUIET_MARGIN))
-        strip = np.rot90(sheet_px, rng.integers(4))[:lines]
+        strip = np.rot90(sheet_px, int(rng.integers(4)))[:lines]
         outline = np.concatenate([strip[0], strip[-1, ::-1]])
         return cv2.fillPoly(light.copy(), [np.round(outline).astype(np.int32)], COVER_LIGHT)
 
@@ -190,7 +190,7 @@ def contrast(grey_levels: float) -> LightChange:
     """Return a dimming of the whole scene after which ink and white are so many grey levels apart."""
 
     def change(light: Image, sheet_px: Array, rng: np.random.Generator) -> Image:
-        codes = np.array([DARKEST_CODE, DARKEST_CODE + grey_levels], np.float32) / 255
+        codes = np.array([DARKEST_CODE, DARKEST_CODE + grey_levels], np.float32) / np.float32(255)
         black, white = linear_from_srgb(codes)
         return black + (light - BLACK_ALBEDO) * (white - black) / (WHITE_ALBEDO - BLACK_ALBEDO)
 

@@ -1,0 +1,296 @@
+"""Finding prints on cylinders nobody measured: bent squares that read like a code, and what confirms them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from astratag.align import COARSE_BLUR, COARSE_STEPS, FINE_STEPS, align
+from astratag.camera import Camera
+from astratag.candidates import FRAME, OUTER, Candidate, darker_inside
+from astratag.codes import Reading
+from astratag.codes.acceptance import chance_of_correlation
+from astratag.codes.soft import correlations, hamming
+from astratag.cylinder import Bent, CylinderWarp, bent_through
+from astratag.detection import LayerDetection
+from astratag.fit import fit_edges
+from astratag.geometry import (
+    CELLS,
+    LAYERS,
+    cell_polygons,
+    layer_points,
+)
+from astratag.grow import ALL_EDGES, Fit, Light, layer_side_px, settle
+from astratag.neighbours import Crossings
+from astratag.search import NARROW, Binarisation, Outlines, find_outlines
+from astratag.signature import SAMPLES, Artwork, Codebook, Warp, cell_values, layer_cells, sample, unit
+from astratag.warp import OUTSIDE_PX, FittedWarp
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+W = TypeVar("W", bound=FittedWarp)
+
+LEAST_SIDE_PX = 24.0
+"""Smaller squares do not show a bend."""
+PROMISING, MAX_CANDIDATES, MAX_READ = 0.42, 4, 200
+"""Correlation from which a bent square is worth fitting; at most so many are fitted, of so many read."""
+LEAST_NEAR_PX, LEAST_BESIDE_PX = 24.0, 3.0
+"""How long the near side of an open square must look, and the straight beginnings of those beside it."""
+LEAST_TURN_RAD, LEAST_ALIKE = 0.4, 0.5
+"""How sharp its two corners must be, and how parallel (as a cosine) the sides beside it."""
+NEAR_TOLERANCE_PX, NEAR_OUTSET_PX = 1.5, 0.4
+MAX_NEAR = 24
+FINE = Binarisation(smooth_px=1, window_px=11)
+SAME_SQUARE = 0.1
+"""Squares whose centres and sizes differ by less than this fraction are one."""
+UNCLEAR = 0.2
+"""A layer is tried whose looks are within so much of the likeliest's."""
+LEAST_SCORE, HOPELESS_LOOKS = 0.35, 0.5
+"""How a square must look as some layer to be moved at all, and after the first steps to go on."""
+LEAST_LOOKS, CLEARLY_OUTERMOST = 0.7, 0.12
+"""How a square must look as the layer it is; and how much better as the outermost, if it is, than as the others."""
+INNERMOST = len(LAYERS) - 1
+WARPS = 100
+"""How many bent squares about one place are read, of which the best counts."""
+LEAST_IN_VIEW, LEAST_CELLS = 0.4, 16
+LIKELY_ANOTHER, CHANCE_OF_BOTH = 1e-2, 1e-8
+"""How rarely chance may read as well as another layer does, and as that and the square itself together.
+
+The latter a hundredth of what is asked of one square read once: an alignment fits cells a little, too.
+"""
+MOVED_PX, MOVED = 4.0, 0.2
+"""How far an alignment may move corners: pixels, or a fraction of the square's side if that is more."""
+WHOLE_HALF_ANGLES_RAD = (0.08, 0.2, 0.33, 0.5, 0.7, 0.9)
+"""How far a whole print may bend to either side of its middle: radii of 6 to 0.55 sides."""
+MAX_STARTS, START_PX = 2, 4.0
+"""How many of the places so found are fitted, and how far from there edges are looked for."""
+CLEAR_BEND = 5.0
+"""A curvature is believed that is so many standard deviations from none."""
+MOVES, DAMPING = 8, 0.03
+"""Damped Gauss-Newton steps from a plane through a bent square's corners onto the square."""
+_CELL_MIDDLES = cell_polygons().mean(axis=1)
+
+
+def fine_outlines(gray: Image) -> Outlines:
+    """Return the outlines of dark shapes at twice the resolution: rings about to close where the print turns away."""
+    twice = cv2.resize(gray, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
+    return find_outlines(twice, FINE)._replace(scale=0.5)
+
+
+def near_sides(gray: Image) -> Array:
+    """Return sides (Q, 2, 2) of dark shapes that may be a square's, clockwise, however its other sides go on.
+
+    The far side of a print may lie at the limb, or its ink run into what is dark behind it.  Both corners of the near
+    side are seen, and how the sides beside it begin.
+    """
+    ink = cv2.adaptiveThreshold(
+        gray, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, NARROW.window_px, NARROW.offset
+    )
+    found: list[Array] = []
+    for contour in cv2.findContours(ink, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)[0]:
+        if len(contour) >= 4 and max(cv2.boundingRect(contour)[2:]) >= LEAST_NEAR_PX:
+            polygon = cv2.approxPolyDP(contour, NEAR_TOLERANCE_PX, True)[::-1, 0].astype(float)
+            if len(polygon) >= 4:
+                found += _near_sides(polygon)
+    found.sort(key=lambda side: -float(np.linalg.norm(side[1] - side[0])))
+    return np.array(found[:MAX_NEAR]).reshape(-1, 2, 2)
+
+
+def _near_sides(polygon: Array) -> list[Array]:
+    """Return the long sides (2, 2) of a clockwise polygon (N, 2) that lie between two corners."""
+    ahead = np.roll(polygon, -1, axis=0) - polygon
+    length = np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)
+    along = ahead / length[:, None]
+    before, after = np.roll(along, 1, axis=0), np.roll(along, -1, axis=0)
+    turn = np.arctan2(before[:, 0] * along[:, 1] - before[:, 1] * along[:, 0], (before * along).sum(axis=1))
+    corner = (turn > LEAST_TURN_RAD) & (turn < np.pi - LEAST_TURN_RAD)
+    beside = np.minimum(np.roll(length, 1), np.roll(length, -1))
+    alike = -(before * after).sum(axis=1) > LEAST_ALIKE
+    use = corner & np.roll(corner, -1) & (length >= LEAST_NEAR_PX) & (beside >= LEAST_BESIDE_PX) & alike
+    outward = np.stack([along[:, 1], -along[:, 0]], axis=1)
+    outset_px = NEAR_OUTSET_PX * np.stack([outward - along, outward + along], axis=1)
+    return list((np.stack([polygon, np.roll(polygon, -1, axis=0)], axis=1) + outset_px)[use])
+
+
+def curved_candidates(gray: Image, bent: Bent, codebook: Codebook) -> list[Candidate]:
+    """Return what bent squares read, the best about each place, the best first."""
+    at = bent.all
+    at = at[darker_inside(sample(gray, bent.project(FRAME, at)))][:MAX_READ] if len(at) else at
+    if len(at) == 0:
+        return []
+    cells, facing = cell_values(gray, bent.project(SAMPLES, at)), bent.facing(_CELL_MIDDLES, at)
+    middle = (cells * facing).sum(axis=1) / np.maximum(facing.sum(axis=1), 1)
+    readings = codebook.read(np.where(facing, cells, middle[:, None]))  # what is hidden says nothing
+    found: list[Candidate] = []
+    for i in sorted(range(len(at)), key=lambda i: -readings[i].correlation):
+        if readings[i].correlation < PROMISING or len(found) == MAX_CANDIDATES:
+            break
+        turns = readings[i].quarter_turns
+        warp = bent.warp(*at[i].tolist()).turned(turns)
+        candidate = Candidate(readings[i], warp(OUTER), warp, bent=True)
+        if candidate.side_px >= LEAST_SIDE_PX and not any(_alike(candidate, before) for before in found):
+            found.append(candidate)
+    return found
+
+
+def _alike(candidate: Candidate, other: Candidate) -> bool:
+    """Return whether two candidates read the same at nearly the same place."""
+    if candidate.reading.marker_id != other.reading.marker_id:
+        return False
+    apart_px = np.linalg.norm(candidate.corners_px.mean(axis=0) - other.corners_px.mean(axis=0))
+    size_px = min(candidate.side_px, other.side_px)
+    return bool(apart_px < SAME_SQUARE * size_px and abs(candidate.side_px - other.side_px) < SAME_SQUARE * size_px)
+
+
+class Seen(NamedTuple):
+    """A whole print that was moved until one ``layer`` of it looks as it reads, and then read in another as well."""
+
+    warp: CylinderWarp
+    square: CylinderWarp
+    """The same as if that layer were the outermost."""
+    layer: int
+    reading: Reading
+
+
+def seen_whole(gray: Image, candidate: Candidate, side_m: float, codebook: Codebook, artwork: Artwork) -> Seen | None:
+    """Return the print a bent square is a layer of; None when it does not look as it reads, or no other layer does.
+
+    The other layer's cells are as good as a second marker with the same code: nothing was fitted to them.
+    """
+    square, marker_id, side_px = candidate.warp, candidate.reading.marker_id, candidate.side_px
+    assert isinstance(square, CylinderWarp)
+    scores = artwork.layer_scores(gray, facing(square), marker_id, side_px)
+    for layer in np.argsort(-scores).tolist():
+        if scores[layer] < max(LEAST_SCORE, scores.max() - UNCLEAR):
+            break
+        moved = _aligned(gray, square, artwork, candidate.reading, layer, side_px)
+        if moved is None or np.abs(moved(OUTER) - square(OUTER)).max() > max(MOVED_PX, MOVED * side_px):
+            continue
+        if layer == INNERMOST:  # so small that it says little of the bend: go on with the next, where it must be
+            layer -= 1
+            moved = moved.of_whole(1.0, LAYERS[INNERMOST].scale / LAYERS[layer].scale)
+            moved = _aligned(gray, moved, artwork, candidate.reading, layer, side_px)
+            if moved is None:
+                continue
+        looks = artwork.layer_scores(gray, facing(moved), marker_id, side_px)
+        if looks[layer] < LEAST_LOOKS or (layer == 0 and looks[0] < looks[1:].max() + CLEARLY_OUTERMOST):
+            continue
+        whole = moved.of_whole(side_m, LAYERS[layer].scale)
+        own, other = (_read(gray, whole, each, marker_id, codebook) for each in (layer, 1 - layer))
+        readings = len(codebook.dictionary.ids) * 4 * WARPS
+        if other.chance <= LIKELY_ANOTHER and own.chance * readings * other.chance <= CHANCE_OF_BOTH:
+            return Seen(whole, moved, layer, own.reading)
+    return None
+
+
+def _aligned(
+    gray: Image, warp: CylinderWarp, artwork: Artwork, reading: Reading, layer: int, side_px: float
+) -> CylinderWarp | None:
+    """Return a square moved until what is in view of it looks like a layer of the marker it reads as; None if hopeless.
+
+    The first steps are taken on a coarser grid of points, which does as well on a blurred picture.
+    """
+    expected, points = artwork.expected(reading.marker_id, side_px)[layer], artwork.points
+    coarse = np.arange(len(points)).reshape(artwork.GRID, -1)[::2, ::2].ravel()
+    for blur, steps, among in ((COARSE_BLUR, COARSE_STEPS, coarse), (0.0, FINE_STEPS, np.arange(len(points)))):
+        seen = among[warp.visible(points[among])]
+        if len(seen) < LEAST_IN_VIEW * len(among):
+            return None
+        warp = align(gray, warp, points[seen], expected[seen], blur=blur, steps=steps)
+        if blur > 0 and artwork.layer_scores(gray, facing(warp), reading.marker_id, side_px)[layer] < HOPELESS_LOOKS:
+            return None
+    return warp
+
+
+def facing(warp: FittedWarp) -> Warp:
+    """Return a warp that takes what does not face the viewer out of the image."""
+    return lambda template: np.where(warp.visible(template)[:, None], warp(template), OUTSIDE_PX)
+
+
+class LayerReading(NamedTuple):
+    """What one layer reads as one marker, and how often chance would read as well in so many cells."""
+
+    reading: Reading
+    chance: float
+
+
+def _read(gray: Image, warp: FittedWarp, layer: int, marker_id: int, codebook: Codebook) -> LayerReading:
+    """Return what the cells in view of one layer of a print say."""
+    cells, kept = layer_cells(gray, warp, layer), cells_in_view(warp, layer, gray.shape)
+    count = int(kept.sum())
+    if count < LEAST_CELLS:
+        return LayerReading(Reading(marker_id, 0, 0.0, CELLS), 1.0)
+    code = codebook.dictionary.signature(marker_id)
+    correlation = float(correlations(cells, kept[None], code[None])[0, 0])
+    if count == CELLS:
+        correlation = max(correlation, codebook.read_as(cells, marker_id, layer_side_px(warp, layer)).correlation)
+    wrong = hamming(cells, kept, code)
+    return LayerReading(Reading(marker_id, 0, correlation, wrong), float(chance_of_correlation(correlation, count)))
+
+
+def cells_in_view(warp: FittedWarp, layer: int, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return which cells (48,) of a layer face the viewer and are inside an image of ``shape`` (H, W)."""
+    corners = layer_points(cell_polygons(), LAYERS[layer]).reshape(-1, 2)
+    at = warp(corners)
+    use = warp.visible(corners) & (at >= 0).all(axis=1) & (at <= (shape[1] - 1, shape[0] - 1)).all(axis=1)
+    return np.asarray(use.reshape(CELLS, -1).all(axis=1))
+
+
+def on_cylinder(
+    light: Light, gray: Image, layers: Sequence[LayerDetection], marker_id: int, artwork: Artwork, like: PrintLike
+) -> Fit | None:
+    """Return the fit of a cylinder to all edges of a marker, begun where measured layers look most like it on one."""
+    tried: list[tuple[float, CylinderWarp]] = []
+    expected = unit(artwork.expected(marker_id)[:1])[0]
+    for seen in layers:
+        scale, origin = LAYERS[seen.layer].scale, LAYERS[seen.layer].origin
+        bent = bent_through(like.camera, seen.corners_px[None], tuple(scale * h for h in WHOLE_HALF_ANGLES_RAD))
+        values = sample(gray, bent.project((artwork.points - origin) / scale, bent.all))
+        best = int((unit(values) @ expected).argmax())
+        likeness = float((unit(values) @ expected)[best])
+        tried.append((likeness, bent.warp(*bent.all[best].tolist()).of_whole(like.side_m, scale)))
+    fits: list[Fit] = []
+    for _, warp in sorted(tried, key=lambda pair: -pair[0])[:MAX_STARTS]:
+        begun = fit_edges(light, warp, ALL_EDGES, START_PX)
+        fit = settle(light, begun.warp, like.near) if begun is not None else None
+        if fit is not None:
+            fits.append(fit)
+    return min(fits, key=lambda fit: fit.cost, default=None)
+
+
+class PrintLike(NamedTuple):
+    """How a print is made and seen, as far as known."""
+
+    camera: Camera
+    side_m: float
+    near: Crossings
+
+
+def clearly_bent(fit: Fit) -> bool:
+    """Return whether a fitted cylinder's curvature is more than noise and the pull of neighbouring edges make."""
+    assert isinstance(fit.warp, CylinderWarp)
+    return bool(fit.warp.curvature > CLEAR_BEND * np.sqrt(fit.covariance[6, 6]))
+
+
+def moved_onto(warp: W, template: Array, points_px: Array) -> W:
+    """Return a warp moved until template points (N, 2) of its print lie nearest to where they are seen (N, 2)."""
+    for _ in range(MOVES):
+        J = warp.jacobian(template).reshape(2 * len(template), -1)
+        scale = np.linalg.norm(J, axis=0) + 1e-12
+        left = (points_px - warp(template)).ravel()
+        damped = np.vstack([J / scale, DAMPING * np.eye(len(scale))])
+        delta = np.linalg.lstsq(damped, np.append(left, np.zeros(len(scale))), rcond=None)[0]
+        warp = warp.stepped(delta / scale)
+    return warp
+
+
+def covariance_of(warp: FittedWarp, template: Array, sigma_px: float) -> Array:
+    """Return the covariance (P, P) of a warp's parameters when template points (N, 2) are known to ``sigma_px``."""
+    J = warp.jacobian(template).reshape(2 * len(template), -1)
+    scale = np.linalg.norm(J, axis=0) + 1e-12
+    information = (J / scale).T @ (J / scale) / sigma_px**2 + np.diag((warp.step_sigma() * scale) ** -2.0)
+    return np.linalg.inv(information) / np.outer(scale, scale)

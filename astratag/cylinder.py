@@ -1,0 +1,259 @@
+"""Prints bent about cylinders nobody measured: a warp with free radius and axis, and squares to begin fitting it with.
+
+A square wrapped about an axis parallel to one of its sides has its four corners in a plane: a rectangle, narrower the
+larger the half-angle it spans.  So a quad in the image, a half-angle and an axis fix two poses.  Where only one side is
+seen whole, that side and the angle the print is turned by fix one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astratag.camera import Camera
+from astratag.geometry import TEMPLATE_UNITS, print_from_template, square
+from astratag.surface import Cylinder
+from astratag.transforms import pose
+from astratag.warp import GRAZING_COSINE, PoseWarp
+
+Array = NDArray[np.float64]
+
+FOCAL_WIDTHS = 1.2
+"""Focal length, in image widths, that a camera is taken to have when nobody knows it."""
+LEAST_CURVATURE, MOST_CURVATURE = 0.02, 2.4
+"""Sides per radius: a bend that nothing would show, and a print that spans 138 degrees."""
+CURVATURE_STEP, AXIS_STEP_RAD = 0.3, 0.3
+"""How far one step may take them, as standard deviations: edges seen square-on say little of either."""
+HALF_ANGLES_RAD = (0.12, 0.3, 0.6)
+"""How far a square may bend to either side of its middle: layers of radii 0.8 to 2 sides are near one of these."""
+TURNS_RAD = (1.13, 1.22, 1.31, 1.4)
+LEANS_RAD = (-0.2, 0.0, 0.2)
+"""How far a print of which only the near side is whole may be turned about it (65 to 80 degrees), and along it."""
+
+
+@dataclass(frozen=True, eq=False)
+class CylinderWarp:
+    """A print of known size on a cylinder of unknown radius and axis: a pose on the cylinder it is believed to be."""
+
+    pose: PoseWarp
+
+    @classmethod
+    def of(cls, camera: Camera, side_m: float, curvature: float, axis_rad: float, T_cam_marker: Array) -> CylinderWarp:
+        """Return a print at ``T_cam_marker`` with ``curvature`` sides per radius, kept within what is believable."""
+        curvature = float(np.clip(curvature, LEAST_CURVATURE, MOST_CURVATURE))
+        return cls(PoseWarp(camera, side_m, Cylinder(side_m / curvature, float(axis_rad)), T_cam_marker))
+
+    @property
+    def surface(self) -> Cylinder:
+        """Return the cylinder."""
+        assert isinstance(self.pose.surface, Cylinder)
+        return self.pose.surface
+
+    @property
+    def curvature(self) -> float:
+        """Return how many sides the radius goes into."""
+        return self.pose.side_m / self.surface.radius_m
+
+    def __call__(self, template: Array) -> Array:
+        """Return pixels (..., 2)."""
+        return self.pose(template)
+
+    def jacobian(self, template: Array) -> Array:
+        """Return the derivative (N, 2, 8): the pose's six, then curvature and axis."""
+        side_m, surface, T = self.pose.side_m, self.surface, self.pose.T_cam_marker
+        on_print = print_from_template(template, side_m)
+        along, across = np.array([(c := np.cos(surface.axis_rad)), (s := np.sin(surface.axis_rad))]), np.array([-s, c])
+        a, b = on_print @ along, on_print @ across
+        angle = b / surface.radius_m
+        sine, cosine = np.sin(angle), np.cos(angle)
+        radius_step = -(surface.radius_m**2) / side_m  # d radius / d curvature
+        bowed = np.column_stack([np.outer(sine - angle * cosine, across), cosine - 1 + angle * sine])
+        flat = np.outer(b - surface.radius_m * sine, along) + np.outer(a * (1 - cosine), across)
+        by_axis = np.column_stack([flat, a * sine])
+        points_cam = surface.points(on_print) @ T[:3, :3].T + T[:3, 3]
+        by_surface = np.stack([radius_step * bowed, by_axis], axis=2)
+        extra = self.pose.camera.projection_jacobian(points_cam) @ (T[:3, :3] @ by_surface)
+        return np.concatenate([self.pose.jacobian(template), extra], axis=2)
+
+    def slopes(self, template: Array, along: Array) -> Array:
+        """Return the derivative (8, N) along unit vectors (2, N)."""
+        return np.einsum("dn,ndp->pn", along, self.jacobian(template))
+
+    def stepped(self, delta: Array) -> CylinderWarp:
+        """Return pose, curvature and axis moved."""
+        moved = self.pose.stepped(delta[:6])
+        curvature, axis_rad = self.curvature + delta[6], self.surface.axis_rad + delta[7]
+        return CylinderWarp.of(moved.camera, moved.side_m, curvature, axis_rad, moved.T_cam_marker)
+
+    def visible(self, template: Array) -> NDArray[np.bool_]:
+        """Return which points face the camera by more than a grazing angle."""
+        return self.pose.visible(template)
+
+    def step_sigma(self) -> Array:
+        """Return limits (8,) on curvature and axis only."""
+        return np.append(np.full(6, np.inf), (CURVATURE_STEP, AXIS_STEP_RAD))
+
+    def of_whole(self, side_m: float, scale: float) -> CylinderWarp:
+        """Return the warp of a print ``side_m`` wide, given that of the square in its middle, ``scale`` of its size."""
+        T = self.pose.T_cam_marker.copy()
+        T[:3, 3] *= side_m * scale / self.pose.side_m
+        return CylinderWarp.of(self.pose.camera, side_m, self.curvature / scale, self.surface.axis_rad, T)
+
+    def turned(self, quarter_turns: int) -> CylinderWarp:
+        """Return the same print with its top at the side ``quarter_turns`` clockwise of this one's."""
+        c, s = ((1, 0), (0, -1), (-1, 0), (0, 1))[quarter_turns % 4]
+        T = self.pose.T_cam_marker @ pose(np.array([(c, -s, 0), (s, c, 0), (0, 0, 1)], dtype=float), np.zeros(3))
+        axis_rad = self.surface.axis_rad + quarter_turns * np.pi / 2
+        return replace(self, pose=replace(self.pose, surface=replace(self.surface, axis_rad=axis_rad), T_cam_marker=T))
+
+
+def assumed_camera(width_px: int, height_px: int) -> Camera:
+    """Return a camera to bend prints with when the real one is unknown."""
+    K = np.eye(3)
+    K[:2] *= FOCAL_WIDTHS * max(width_px, height_px)
+    K[:2, 2] = (width_px - 1) / 2, (height_px - 1) / 2
+    return Camera(K, width=width_px, height=height_px)
+
+
+@dataclass(frozen=True, eq=False)
+class Bent:
+    """Squares of side 1 on cylinders, M about each of Q places: curvature and axis (M,), and poses."""
+
+    camera: Camera
+    curvature: Array
+    axis_rad: Array
+    rotation: Array
+    """(Q, M, 3, 3), R_cam_marker."""
+    translation: Array
+    """(Q, M, 3), t_cam_marker, sides."""
+
+    @property
+    def all(self) -> NDArray[np.int64]:
+        """Return the place and model (Q M, 2) of each."""
+        return np.argwhere(np.ones(self.translation.shape[:2], dtype=bool))
+
+    def warp(self, place: int, model: int) -> CylinderWarp:
+        """Return one of them as a warp of a print one metre wide."""
+        T = pose(self.rotation[place, model], self.translation[place, model])
+        return CylinderWarp.of(self.camera, 1.0, self.curvature[model], self.axis_rad[model], T)
+
+    def project(self, template: Array, which: NDArray[np.int64]) -> Array:
+        """Return where template points (S, 2) lie in the image (N, S, 2) for those ``which`` (N, 2)."""
+        points_cam = self._cam(template, which)[0]
+        points_cam[..., 2] = np.maximum(points_cam[..., 2], 1e-3)
+        return self.camera.project(points_cam.reshape(-1, 3)).reshape(*points_cam.shape[:2], 2)
+
+    def facing(self, template: Array, which: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which template points (N, S) face the viewer by more than a grazing angle."""
+        points_cam, normals_cam = self._cam(template, which)
+        return -(points_cam * normals_cam).sum(axis=2) > GRAZING_COSINE * np.linalg.norm(points_cam, axis=2)
+
+    def _cam(self, template: Array, which: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Return points and outward normals (N, S, 3) in the camera frame."""
+        on_print = print_from_template(template, 1.0)
+        surfaces = [Cylinder(1 / k, axis) for k, axis in zip(self.curvature, self.axis_rad, strict=True)]
+        points, normals = (np.stack([getattr(s, of)(on_print) for s in surfaces]) for of in ("points", "normals"))
+        place, model = which.T
+        turn = self.rotation[place, model].swapaxes(-1, -2)
+        return points[model] @ turn + self.translation[place, model, None], normals[model] @ turn
+
+
+def bent_through(camera: Camera, quads: Array, half_angles_rad: tuple[float, ...] = HALF_ANGLES_RAD) -> Bent:
+    """Return the bent squares whose corners are seen at quads (Q, 4, 2), clockwise from the top left.
+
+    Both poses of each rectangle from the derivative of its homography at the centre: Collins and Bartoli,
+    "Infinitesimal plane-based pose estimation", IJCV 2014, equations 14 to 20.
+    """
+    models = [(h, axis) for h in half_angles_rad for axis in (0.0, np.pi / 2)]
+    half_angle, axis_rad = (np.repeat(part, 2) for part in np.array(models).T)
+    narrow = 0.5 * np.sin(half_angle) / half_angle  # half the chord across the axis
+    wide = np.full_like(narrow, 0.5)
+    sagitta = 0.5 * (1 - np.cos(half_angle)) / half_angle
+    halves = np.where((axis_rad == 0.0)[:, None], np.stack([wide, narrow], axis=1), np.stack([narrow, wide], axis=1))
+    p, J = _at_centre(camera.undistort(quads.reshape(-1, 2)).reshape(-1, 4, 2))
+    rotation, depth = _two_poses(p[:, None], J[:, None] / halves[None, ::2, None, :])
+    centre = depth[..., None] * np.concatenate([p, np.ones((len(p), 1))], axis=1)[:, None]
+    centre = centre.repeat(2, axis=1)
+    rotation = rotation.reshape(*centre.shape, 3)
+    translation = centre + rotation[..., 2] * sagitta[:, None]
+    return Bent(camera, 2 * half_angle, axis_rad, rotation, translation)
+
+
+def bent_beside(camera: Camera, sides: Array) -> Bent:
+    """Return bent squares whose tops, straight and whole, are seen at sides (Q, 2, 2), and whose bottoms turn away.
+
+    The pose whose rotation is given takes two points to where they are seen: linear in its translation.
+    """
+    models = np.array(list(product(HALF_ANGLES_RAD, TURNS_RAD, LEANS_RAD)))
+    half_angle, turn, lean = models.T
+    rays = camera.undistort(sides.reshape(-1, 2)).reshape(-1, 2, 2)
+    aim = _aim(rays.mean(axis=1))
+    (x, y), zero = (rays[:, 1] - rays[:, 0]).T, np.zeros(len(rays))
+    c, s = x / np.hypot(x, y), y / np.hypot(x, y)
+    roll = _matrices([[c, -s, zero], [s, c, zero], [zero, zero, zero + 1]])
+    c, s, zero = np.cos(lean), np.sin(lean), np.zeros(len(models))
+    leant = _matrices([[c, zero, s], [zero, zero + 1, zero], [-s, zero, c]])
+    c, s = np.cos(turn), np.sin(turn)
+    turned = _matrices([[zero + 1, zero, zero], [zero, -c, s], [zero, -s, -c]])  # y up and z out of the face
+    rotation = (aim @ roll)[:, None] @ (leant @ turned)[None]
+    top = print_from_template(square(0.0, TEMPLATE_UNITS)[:2], 1.0)
+    ends = np.stack([Cylinder(0.5 / h).points(top) for h in half_angle])
+    ends_cam = ends @ rotation.swapaxes(-1, -2)
+    A = np.zeros((len(rays), 4, 3))
+    A[:, 0::2, 0] = A[:, 1::2, 1] = 1.0
+    A[:, 0::2, 2], A[:, 1::2, 2] = -rays[..., 0], -rays[..., 1]
+    b = (rays[:, None] * ends_cam[..., 2:] - ends_cam[..., :2]).reshape(*rotation.shape[:2], 4)
+    translation = b @ np.linalg.pinv(A).swapaxes(-1, -2)
+    return Bent(camera, 2 * half_angle, 0.0 * half_angle, rotation, translation)
+
+
+def _matrices(rows: list[list[Array]]) -> Array:
+    """Return matrices (N, 3, 3) from rows of columns of entries (N,)."""
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _aim(p: Array) -> Array:
+    """Return the shortest rotations (..., 3, 3) that take the optical axis to rays (..., 2) at unit depth."""
+    x, y = p[..., 0], p[..., 1]
+    r2 = x * x + y * y
+    t = np.sqrt(r2 + 1)
+    k = -1 / (t * (t + 1))
+    return _matrices([[1 + k * x * x, k * x * y, x / t], [k * x * y, 1 + k * y * y, y / t], [-x / t, -y / t, 1 / t]])
+
+
+def _at_centre(quads: Array) -> tuple[Array, Array]:
+    """Return where homographies take the centre (Q, 2) of a -1..1 square, y up, and its derivative (Q, 2, 2) there."""
+    p0, p1, p2, p3 = (quads[:, corner] for corner in range(4))
+    d1, d2, total = p1 - p2, p3 - p2, p0 - p1 + p2 - p3
+    area = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
+    area = np.where(np.abs(area) > 1e-12, area, np.inf)
+    g = ((total[:, 0] * d2[:, 1] - total[:, 1] * d2[:, 0]) / area)[:, None]
+    h = ((d1[:, 0] * total[:, 1] - d1[:, 1] * total[:, 0]) / area)[:, None]
+    across, down = p1 - p0 + g * p1, p3 - p0 + h * p3
+    depth = 1 + (g + h) / 2
+    depth = np.where(np.abs(depth) > 1e-6, depth, 1e-6)
+    centre = (p0 + (across + down) / 2) / depth
+    J = np.stack([(across - g * centre) / depth, -(down - h * centre) / depth], axis=2) / 2
+    return centre, J
+
+
+def _two_poses(p: Array, J: Array) -> tuple[Array, Array]:
+    """Return both rotations (..., 2, 3, 3) and the depth (...) of a plane seen at p (..., 2) with derivative J."""
+    turn = _aim(p)
+    B = turn[..., :2, :2] - p[..., :, None] * turn[..., 2:, :2]
+    A = np.linalg.solve(np.broadcast_to(B, J.shape), J)
+    S = A @ A.swapaxes(-1, -2)
+    mean, gap = (S[..., 0, 0] + S[..., 1, 1]) / 2, np.hypot((S[..., 0, 0] - S[..., 1, 1]) / 2, S[..., 0, 1])
+    gamma = np.maximum(np.sqrt(mean + gap), 1e-12)
+    R2 = A / gamma[..., None, None]
+    square_left = np.maximum(1 - (R2 * R2).sum(axis=-2), 0.0)
+    b = np.sqrt(square_left)
+    b[..., 1] *= np.where((R2[..., 0] * R2[..., 1]).sum(axis=-1) > 0, -1.0, 1.0)
+    both = []
+    for sign in (1.0, -1.0):
+        first, second = (np.concatenate([R2[..., i], sign * b[..., i : i + 1]], axis=-1) for i in (0, 1))
+        both.append(turn @ np.stack([first, second, np.cross(first, second)], axis=-1))
+    return np.stack(both, axis=-3), 1 / gamma

@@ -1,0 +1,199 @@
+"""Proposals against shapes drawn with known corners, and the bounds on what any one image may cost, in counts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+import astratag.detector
+from astratag import Camera, Detector, Flat, load_dictionary
+from astratag.candidates import Candidate
+from astratag.codes import Reading
+from astratag.detector import MAX_ALIGNED, MAX_BY_EDGES, MAX_MATCHED, outer_corners
+from astratag.effort import Tries, first_distinct
+from astratag.geometry import LAYERS, TEMPLATE_UNITS, square
+from astratag.search import COARSE, MAX_CONTOURS, NARROW, PLAIN, bent_quads_of, find_outlines, quads_of
+from astratag.transforms import exp_so3, pose
+from astratag.warp import HomographyWarp, PoseWarp
+from pipeline.render import render_marker
+
+HEIGHT, WIDTH = 240, 320
+
+
+def drawn(*outlines: np.ndarray) -> np.ndarray:
+    """Return a white picture with filled dark outlines (N, 2), drawn eight times finer and averaged."""
+    fine = np.full((8 * HEIGHT, 8 * WIDTH), 220, np.uint8)
+    for outline in outlines:
+        cv2.fillPoly(fine, [np.round(8 * outline + 3.5).astype(np.int32)], 30)
+    return cv2.resize(fine, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+
+
+def turned_square(seed: int) -> np.ndarray:
+    """Return a square (4, 2) seen at a slant."""
+    rng = np.random.default_rng(seed)
+    angle, side, squeeze = rng.uniform(0, 2 * np.pi), rng.uniform(40, 110), rng.uniform(0.4, 1.0)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    corners = square(-0.5, 0.5) * side * (1.0, squeeze)
+    return corners @ turn.T + rng.uniform(-10, 10, 2) + (WIDTH / 2, HEIGHT / 2)
+
+
+def nearest(quads: np.ndarray, corners: np.ndarray) -> tuple[int, int, float]:
+    """Return which quad (Q, 4, 2), begun at which corner, comes nearest to corners (4, 2), and how near, in pixels."""
+    apart = [[np.linalg.norm(np.roll(quad, -k, axis=0) - corners, axis=1).max() for k in range(4)] for quad in quads]
+    quad, start = np.unravel_index(np.argmin(apart), (len(quads), 4))
+    return int(quad), int(start), float(np.min(apart))
+
+
+@pytest.mark.parametrize("how", [COARSE, PLAIN], ids=["coarse", "plain"])
+@pytest.mark.parametrize("whole", [True, False], ids=["whole", "all"])
+def test_a_dark_square_is_proposed_to_two_pixels_of_the_resolution_worked_at(how, whole):
+    for seed in range(12):
+        corners = turned_square(seed)
+        assert nearest(quads_of(find_outlines(drawn(corners), how), whole=whole), corners)[2] < 2.0 / how.scale
+
+
+def test_a_square_with_a_notch_is_proposed_by_its_hull():
+    corners = turned_square(3)
+    notch = corners.mean(axis=0)
+    notched = np.insert(
+        corners, 1, [0.6 * corners[0] + 0.4 * corners[1], notch, 0.4 * corners[0] + 0.6 * corners[1]], 0
+    )
+    outlines = find_outlines(drawn(notched))
+    assert nearest(quads_of(outlines), corners)[2] < 2.0
+    assert len(quads_of(outlines, whole=True)) == 0
+
+
+def test_bulges_against_the_parabolas_drawn():
+    along = np.linspace(0.0, 1.0, 40, endpoint=False)[:, None]
+    for seed in range(12):
+        corners = turned_square(seed)
+        ahead = np.roll(corners, -1, axis=0) - corners
+        outward = np.stack([ahead[:, 1], -ahead[:, 0]], axis=1) / np.linalg.norm(ahead, axis=1, keepdims=True)
+        height = np.random.default_rng(seed).uniform(-5, 8, 4)
+        bulge = height[:, None, None] * (4 * along * (1 - along)) * outward[:, None]
+        sides = corners[:, None] + along * ahead[:, None] + bulge
+        bent = bent_quads_of(find_outlines(drawn(sides.reshape(-1, 2))))
+        quad, start, apart_px = nearest(bent.corners_px, corners)
+        assert apart_px < 4.0
+        bulges = np.roll(bent.bulges_px[quad], -start, axis=0)
+        assert np.abs((bulges * outward).sum(axis=1) - height).max() < 2.5
+
+
+def test_distinct_squares_against_one_by_one():
+    rng = np.random.default_rng(0)
+    squares = np.array([turned_square(seed) for seed in range(5)])
+    quads = squares[rng.integers(0, 5, 60)] + rng.uniform(-0.3, 0.3, (60, 1, 2))
+    for most in (0, 2, 20):
+        kept = first_distinct(quads, squares[:1], most)
+        assert len(kept) == min(most, 4)
+        for i, quad in enumerate(kept):
+            assert all(np.abs(quad - other).max() > 1.0 for other in [squares[0], *kept[:i]])
+
+
+def test_a_square_is_tried_again_only_if_it_reads_better_and_never_more_than_so_many():
+    corners = turned_square(0)
+    warp = HomographyWarp.from_points(square(0.0, TEMPLATE_UNITS), corners)
+    first = Candidate(Reading(3, 0, 0.7, 2), corners, warp)
+    tries = Tries(3)
+    assert tries.take(first) and not tries.take(first)
+    assert not tries.take(replace(first, corners_px=corners + 0.1))
+    assert tries.take(replace(first, reading=Reading(3, 0, 0.71, 2)))
+    assert tries.take(replace(first, reading=Reading(4, 0, 0.6, 2)))
+    assert not tries.take(replace(first, corners_px=corners + 50.0))
+    assert len(tries.made) == 3
+
+
+def adversarial(kind: str) -> np.ndarray:
+    """Return a picture with as much to look at as can be, and no marker."""
+    rng = np.random.default_rng(len(kind))
+    noise = rng.integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
+    if kind == "noise":
+        return noise
+    if kind == "blobs":
+        return ((cv2.GaussianBlur(noise, (0, 0), 2.0) > 127) * 255).astype(np.uint8)
+    if kind == "board":
+        return ((np.indices(noise.shape) // 8).sum(axis=0) % 2 * 255).astype(np.uint8)
+    if kind == "JPEG":
+        small = cv2.imdecode(cv2.imencode(".jpg", noise[::4, ::4], [cv2.IMWRITE_JPEG_QUALITY, 10])[1], 0)
+        return cv2.resize(small, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+    image = np.full_like(noise, 220)  # squares, with borders like a marker's and nonsense inside
+    for y in range(4, HEIGHT - 30, 32):
+        for x in range(4, WIDTH - 30, 32):
+            image[y : y + 24, x : x + 24] = 20
+            image[y + 3 : y + 21, x + 3 : x + 21] = np.kron(rng.random((6, 6)) < 0.4, np.ones((3, 3))) * 200 + 20
+    return cv2.GaussianBlur(image, (0, 0), 0.7)
+
+
+def counting(counts: dict[str, int], name: str) -> Callable:
+    """Return a function of the detector's that counts its calls."""
+    function = getattr(astratag.detector, name)
+
+    def counted(*args, **options):
+        counts[name] += 1
+        return function(*args, **options)
+
+    return counted
+
+
+@pytest.mark.parametrize("surface", [None, Flat()], ids=["unknown", "flat"])
+@pytest.mark.parametrize("kind", ["noise", "blobs", "board", "JPEG", "squares"])
+def test_no_image_is_looked_at_closely_more_often_than_bounded(kind, surface, monkeypatch):
+    """Counts, not clocks: the bounds hold over all ways of telling ink from paper together."""
+    counts = {"find_outlines": 0, "match": 0, "grow": 0}
+    for name in counts:
+        monkeypatch.setattr(astratag.detector, name, counting(counts, name))
+    detector = Detector(surface=surface)
+    view = detector.view(
+        adversarial(kind), Camera([[300, 0, 160], [0, 300, 120], [0, 0, 1]], width=WIDTH, height=HEIGHT)
+    )
+    assert detector.find(view) == []
+    assert len(view.by_edges.made) <= MAX_BY_EDGES and len(view.aligned.made) <= MAX_ALIGNED
+    assert counts["match"] <= MAX_MATCHED and counts["find_outlines"] <= 9
+    assert counts["grow"] <= len(LAYERS) * (MAX_BY_EDGES + MAX_ALIGNED)
+
+
+def test_noise_has_no_outlines_where_every_pixel_counts():
+    noise = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
+    assert find_outlines(noise, NARROW).contours == []
+    assert len(find_outlines(noise, PLAIN).contours) <= MAX_CONTOURS
+
+
+def close_up(range_m: float, roll_rad: float) -> tuple[np.ndarray, Camera, np.ndarray]:
+    """Return a marker's picture by a small wide camera, the camera, and the marker's pose."""
+    camera = Camera([[290, 0, 159.5], [0, 290, 119.5], [0, 0, 1]], width=WIDTH, height=HEIGHT)
+    T = pose(np.diag([1.0, -1.0, -1.0]) @ exp_so3([0.0, 0.0, roll_rad]) @ exp_so3([0.2, 0.1, 0.0]), [0, 0, range_m])
+    signature = load_dictionary().signature(7)
+    return render_marker(camera, T, signature=signature, side_m=0.1, surface=Flat(), seed=1), camera, T
+
+
+def test_a_plain_marker_costs_one_look():
+    """Its inner squares read as well as its outer one, and are not looked at once that is a marker."""
+    image, camera, _ = close_up(0.3, 0.4)
+    detector = Detector(surface=Flat())
+    view = detector.view(image, camera)
+    assert [seen.marker_id for seen in detector.find(view)] == [7]
+    assert len(view.by_edges.made) == 1 and not view.aligned.made
+
+
+def test_the_innermost_square_is_read_with_a_corner_cut():
+    """At 3 cm only the innermost square is in view, and at this roll the image's border cuts off a corner."""
+    image, camera, T = close_up(0.03, np.pi / 4)
+    innermost = PoseWarp(camera, 0.1, Flat(), T)(square(*LAYERS[2].black))
+    assert (innermost < 0).any()
+    (seen,) = Detector(surface=Flat()).detect(image, camera)
+    assert seen.marker_id == 7
+    np.testing.assert_allclose(seen.T_cam_marker, T, atol=2e-3)
+
+
+def test_a_corner_behind_the_camera_is_where_the_lines_of_its_sides_meet():
+    _, camera, _ = close_up(0.03, np.pi / 4)
+    T = pose(np.diag([1.0, -1.0, -1.0]) @ exp_so3([0.0, 0.0, 0.8]) @ exp_so3([0.8, 0.0, 0.0]), [0.0, 0.0, 0.03])
+    corners = T[:3, :3] @ np.array([(-0.05, 0.05, 0), (0.05, 0.05, 0), (0.05, -0.05, 0), (-0.05, -0.05, 0)]).T
+    x, y, depth = camera.K @ (corners + T[:3, 3:])
+    assert (depth < 0).any() and (depth > 0).any()
+    found = outer_corners(PoseWarp(camera, 0.1, Flat(), T))
+    np.testing.assert_allclose(found, np.stack([x, y], axis=1) / depth[:, None], rtol=1e-3, atol=0.1)
