@@ -9,14 +9,17 @@ framework", 2020.
 
 from __future__ import annotations
 
+import matplotlib
 import numpy as np
-from Basilisk.simulation import extForceTorque, spacecraft
-from Basilisk.utilities import RigidBodyKinematics, SimulationBaseClass, simIncludeGravBody
 from numpy.typing import NDArray
 
 from pipeline.convert import NS_PER_S
 from pipeline.dock_scenario import DockScenario
 from pipeline.plant import Departure, Flight, hill_from_inertial
+
+with matplotlib.rc_context():  # importing Basilisk changes how figures are laid out: that must not reach our reports
+    from Basilisk.simulation import extForceTorque, spacecraft
+    from Basilisk.utilities import RigidBodyKinematics, SimulationBaseClass, simIncludeGravBody
 
 Array = NDArray[np.float64]
 
