@@ -197,6 +197,24 @@ class Bus:
             )
         publisher.put(json.dumps(asdict(credit)).encode())
 
+    @property
+    def session_id(self) -> str:
+        """Return the session's Zenoh id, as it is written in the keys of others' liveliness tokens."""
+        return str(self._session.zid())
+
+    def declare_foreign(self, token: str) -> None:
+        """Be known to another system, such as ROS 2, by a liveliness token of its own kind."""
+        self._kept.append(self._session.liveliness().declare_token(token))
+
+    def publish_foreign(self, key: str, payload: bytes, attachment: bytes | None = None) -> None:
+        """Send bytes under a key that is not in our table of topics; they are dropped where a reader is slow."""
+        publisher = self._publishers.get(key)
+        if publisher is None:
+            publisher = self._publishers[key] = self._session.declare_publisher(
+                key, congestion_control=zenoh.CongestionControl.DROP, express=True
+            )
+        publisher.put(payload, attachment=attachment)
+
     def close(self) -> None:
         """Leave the bus; without this a process can hang at its exit."""
         self._session.close()

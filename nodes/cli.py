@@ -85,6 +85,8 @@ def _parser() -> argparse.ArgumentParser:
     recover = command("recover", "nodes.tools:recover", "Make a recording whole that was cut off.", example)
     recover.add_argument("recording", metavar="FILE", type=Path, help="the truncated recording")
     recover.add_argument("--out", type=Path, help="where the whole one goes (default: FILE.recovered.mcap beside it)")
+    example = "relnav export out/replay/run.mcap states.csv"
+    _export(command("export", "nodes.tools:export", "Write a recording's states as a file of another kind.", example))
     command("doctor", "nodes.doctor:doctor", "Check this installation, and say how to mend it.", "relnav doctor")
     example = "relnav node detector --mission mission.yaml --connect tcp/router:7447"
     _node(command("node", "nodes.node:main", "Run one node against a Zenoh router.", example))
@@ -190,14 +192,31 @@ def _dictionary(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON that --dictionary reads")
 
 
+def _export(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recording", metavar="RUN", type=Path, help="the run.mcap of a replay or a live run")
+    parser.add_argument("out", metavar="OUT", type=Path, help="the file to write")
+    kinds = ("csv", "parquet", "oem", "aem")
+    parser.add_argument("--as", dest="kind", choices=kinds, help="default: as the name of OUT ends")
+    parser.add_argument("--chaser", default="CHASER", metavar="NAME", help="OEM, AEM: its name (%(default)s)")
+    parser.add_argument("--target", default="TARGET", metavar="NAME", help="OEM, AEM: its name (%(default)s)")
+    parser.add_argument("--originator", default="RELNAV", metavar="NAME", help="OEM, AEM: who made it (%(default)s)")
+
+
 def _node(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("name", choices=("source", "detector", "pose_filter", "recorder", "viewer"))
+    parser.add_argument("name", choices=("source", "detector", "pose_filter", "recorder", "viewer", "relay"))
     parser.add_argument("--connect", metavar="ENDPOINT", default="tcp/127.0.0.1:7447", help="default: %(default)s")
     parser.add_argument("--out", type=Path, default=Path("out/live"), help="recorder, viewer: folder (%(default)s)")
     parser.add_argument("--source", help="source: /dev/video0, or a recording, video or folder")
     parser.add_argument("--loop", action="store_true", help="source: play a file again and again")
     parser.add_argument("--view", choices=("native", "web", "none"), default="none", help="viewer (%(default)s)")
     parser.add_argument("--bind", default="127.0.0.1", help="viewer: address of the page (%(default)s)")
+    parser.add_argument(
+        "--to",
+        action="append",
+        metavar="WHERE",
+        help="relay: udp://HOST:PORT, udp+json://HOST:PORT, 42://HOST:PORT[/SC], ros2 or ros2dds, also as "
+        "ros2://HOST:PORT for another router; may be given several times",
+    )
     _viewer_ports(parser)
     _source_options(parser)
     # What only the supervisor says.

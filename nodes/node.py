@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 from nodes.bus import Bus, Link
-from nodes.processes import process_named
+from nodes.processes import Process, process_named
 from nodes.shell import NodeOptions, Shell, StopSignal, Work
 from nodes.source import Pace, Resume, SourceNode
 from pipeline.mission import Mission
@@ -25,6 +25,9 @@ def main(args: argparse.Namespace) -> None:
         return
     mission = _mission(args.mission)
     options = _options(args, mission)
+    if process.name == "relay":
+        _run_relay(args, process, link, options, stop)
+        return
     work = _work(args, options)
     with Bus(link, vehicle=mission.vehicle, node=process.name, lossless=options.lossless) as bus:
         Shell(process, work, options, bus, stop).run()
@@ -61,6 +64,18 @@ def _run_source(args: argparse.Namespace, link: Link, stop: StopSignal) -> None:
     pace = Pace(speed=None if math.isinf(args.speed) else args.speed, loop=args.loop, resume=_resume(args.resume))
     with Bus(link, vehicle=source.mission.vehicle, node="source", lossless=options.lossless) as bus:
         SourceNode(source, pace, options, bus, stop).run()
+
+
+def _run_relay(args: argparse.Namespace, process: Process, link: Link, options: NodeOptions, stop: StopSignal) -> None:
+    from nodes.relay import RelayWork, open_outlet, parse_destination
+
+    if not args.to:
+        raise ValueError("the relay node needs --to: where states go, such as udp://127.0.0.1:5600 or ros2")
+    destinations = [parse_destination(text) for text in args.to]
+    vehicle = options.mission.vehicle
+    with Bus(link, vehicle=vehicle, node=process.name, lossless=False) as bus:
+        outlets = [(to.text, open_outlet(to, vehicle, bus)) for to in destinations]
+        Shell(process, RelayWork(outlets, _warn), options, bus, stop).run()
 
 
 def _resume(text: str | None) -> Resume | None:

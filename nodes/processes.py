@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from pipeline.steps import STEPS
 from schemas import TOPICS, Topic
-from schemas.topics import CALIBRATION, FRAME, GUIDANCE, HEALTH, TRUTH
+from schemas.topics import CALIBRATION, FRAME, GUIDANCE, HEALTH, STATE, TRUTH
 
 
 @dataclass(frozen=True)
@@ -40,13 +40,17 @@ PROCESSES = (
 )
 """In the order of the data: each process consumes only what those before it publish, and everybody's health."""
 
+RELAY = Process("relay", (STATE,), (), required=False)
+"""Not part of a run: the user starts one beside it for each consumer that is not on the bus."""
+
 
 def process_named(name: str) -> Process:
     """Return a row of the table.  Raises ValueError for a name that is not in it."""
-    for process in PROCESSES:
+    everything = (*PROCESSES, RELAY)
+    for process in everything:
         if process.name == name:
             return process
-    raise ValueError(f"there is no node {name!r}; the nodes are {', '.join(p.name for p in PROCESSES)}")
+    raise ValueError(f"there is no node {name!r}; the nodes are {', '.join(p.name for p in everything)}")
 
 
 def producers(process: Process) -> tuple[Process, ...]:

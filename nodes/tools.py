@@ -1,10 +1,11 @@
-"""The commands that need no bus: ``relnav detect``, ``marker``, ``dictionary``, ``score`` and ``recover``."""
+"""The commands that need no bus: ``relnav detect``, ``marker``, ``dictionary``, ``score``, ``recover``, ``export``."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import sys
+import time
 from typing import Any
 
 from rich.console import Console
@@ -83,6 +84,20 @@ def score(args: argparse.Namespace) -> None:
     report = args.recording.with_suffix(".report.png")
     write_report(args.recording, summary, report)
     print(f"written: {report}")
+
+
+def export(args: argparse.Namespace) -> None:
+    """Write a recording's states as CSV, Parquet, OEM or AEM."""
+    from pipeline.adapters.ccsds import Names
+    from pipeline.exports import KINDS
+    from pipeline.exports import export as export_recording
+
+    kind = args.kind or args.out.suffix.removeprefix(".").lower()
+    if kind not in KINDS:
+        raise ValueError(f"cannot tell from its name what {args.out} is to be: say --as {', '.join(KINDS)}")
+    names = Names(chaser=args.chaser, target=args.target, originator=args.originator)
+    done = export_recording(args.recording, args.out, kind, names, created_ns=time.time_ns())
+    print(f"{args.out}: {done.written} of {done.states} states")
 
 
 def recover(args: argparse.Namespace) -> None:
