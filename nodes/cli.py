@@ -71,6 +71,8 @@ def _parser() -> argparse.ArgumentParser:
     _replay(command("replay", "nodes.run:replay", "Replay a recording, video or folder and score it.", "relnav replay"))
     example = "relnav live --source /dev/video0 --camera camera.yaml --mission mission.yaml"
     _live(command("live", "nodes.run:live", "Navigate on a camera, or on a file as if it were one.", example))
+    example = "relnav dock --seed 3 --out out/dock"
+    _dock(command("dock", "nodes.run:dock", "Fly a docking in closed loop with the simulator Basilisk.", example))
     example = "relnav detect images/ --camera camera.json --side-m 0.1 --json found.json"
     _detect(command("detect", "nodes.tools:detect", "Find markers in images, folders, videos and recordings.", example))
     example = "relnav marker 0 1 2 --side-mm 100 --format pdf --out markers"
@@ -104,7 +106,7 @@ def _replay(parser: argparse.ArgumentParser) -> None:
 
 
 def _live(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--source", required=True, help="/dev/video0, or a recording, video or folder")
+    parser.add_argument("--source", required=True, help="/dev/video0, a recording, video or folder, or sim[:FILE]")
     parser.add_argument("--duration", type=_positive, metavar="S", help="stop after so many seconds")
     parser.add_argument("--loop", action="store_true", help="play a file again and again")
     parser.add_argument(
@@ -115,6 +117,17 @@ def _live(parser: argparse.ArgumentParser) -> None:
     )
     _run_options(parser, out=None)
     _source_options(parser)
+
+
+def _dock(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "scenario", nargs="?", type=Path, help="what is flown, YAML (default: 20 m along the velocity to the port)"
+    )
+    parser.add_argument("--seed", type=_natural, metavar="N", help="another seed, another flight (default: 0)")
+    parser.add_argument("--real-time", action="store_true", help="as time passes (default: lockstep, repeatable)")
+    parser.add_argument("--direct", action="store_true", help="in this process, without the bus: same results")
+    _run_options(parser, out="out/dock")
+    parser.set_defaults(camera=None, mission=None, fps=None, scale_camera=False, duration=None)
 
 
 def _run_options(parser: argparse.ArgumentParser, *, out: str | None) -> None:
@@ -218,6 +231,13 @@ def _positive(text: str) -> float:
     value = float(text)
     if not 0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"must be positive, got {text}")
+    return value
+
+
+def _natural(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"must not be negative, got {text}")
     return value
 
 

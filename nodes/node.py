@@ -58,6 +58,8 @@ def _run_source(args: argparse.Namespace, link: Link, stop: StopSignal) -> None:
         args.source, camera=args.camera, mission=args.mission, fps=args.fps, scale_camera=args.scale_camera
     )
     source.on_warning = _warn
+    if source.closed_loop:
+        source.live = not args.lossless
     options = _options(args, source.mission)
     pace = Pace(speed=None if math.isinf(args.speed) else args.speed, loop=args.loop, resume=_resume(args.resume))
     with Bus(link, vehicle=source.mission.vehicle, node="source", lossless=options.lossless) as bus:

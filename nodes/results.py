@@ -16,7 +16,7 @@ from nodes.recorder import existing_parts, join_parts
 from nodes.supervisor import Outcome
 from pipeline.mission import Mission
 
-RRD, SUMMARY, REPORT = "run.rrd", "summary.json", "report.png"
+RRD, SUMMARY, REPORT, DOCKING = "run.rrd", "summary.json", "report.png", "docking.json"
 
 
 @contextlib.contextmanager
@@ -26,7 +26,7 @@ def folder_for_results(out: Path, spec: str, *, overwrite: bool) -> Iterator[Non
     ``overwrite`` takes away the files of an earlier run, and only those: a replay can be had again, a live run
     cannot.  Raises ValueError when the folder cannot be written, is another run's, or holds what may not be lost.
     """
-    stale = [*existing_parts(out), *(out / name for name in (RRD, SUMMARY, REPORT))]
+    stale = [*existing_parts(out), *(out / name for name in (RRD, SUMMARY, REPORT, DOCKING))]
     if Path(spec).resolve() in [path.resolve() for path in stale]:
         raise ValueError(f"{spec} would be overwritten by its own replay: choose another folder with --out")
     with contextlib.ExitStack() as stack:

@@ -1,4 +1,4 @@
-"""``relnav replay`` and ``relnav live``: plan a run, run it, score it."""
+"""``relnav replay``, ``relnav live`` and ``relnav dock``: plan a run, run it, score it."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from rich.console import Console
 from rich.markup import escape
@@ -23,11 +23,14 @@ from nodes.cli import EXIT_INTERRUPTED
 from nodes.processes import PROCESSES
 from nodes.progress import RunProgress
 from nodes.recorder import join_parts
-from nodes.results import RRD, finish_results, folder_for_results
+from nodes.results import DOCKING, RRD, finish_results, folder_for_results
 from nodes.supervisor import Hooks, Outcome, Plan, RunError, Supervisor
 from pipeline.mission import Mission
 from pipeline.sources import Source, open_source
 from pipeline.steps import Sink
+
+if TYPE_CHECKING:
+    from pipeline.dock_scenario import DockScenario
 
 SHIPPED_RECORDING = Path(__file__).resolve().parent.parent / "recordings" / "corridor.mcap"
 
@@ -82,6 +85,49 @@ def live(args: argparse.Namespace) -> int:
         if (subject.live or args.loop) and args.duration is None:
             outcome = Outcome(completed=True, died=outcome.died)  # Ctrl-C is how such a run ends
         return _conclude(args.out, subject, outcome, console)
+
+
+def dock(args: argparse.Namespace) -> int:
+    """Fly a docking in closed loop with the simulator, and tell how it went."""
+    from pipeline.dock import require_basilisk
+    from pipeline.dock_report import print_docking, report_docking
+    from pipeline.dock_scenario import DockScenario
+
+    if args.direct and args.real_time:
+        raise ValueError("--direct is lockstep: leave out --real-time")
+    require_basilisk()
+    scenario = DockScenario() if args.scenario is None else DockScenario.load(args.scenario)
+    scenario = scenario if args.seed is None else scenario.model_copy(update={"seed": args.seed})
+    load_dictionary(scenario.mission.dictionary)
+    console, view = _console(), _view(args, _console())
+    with folder_for_results(args.out, str(args.scenario or ""), overwrite=True), _scenario_file(scenario) as path:
+        subject = Subject(f"dock:{path}", scenario.mission, None, args.real_time, ())
+        pace = "real time" if args.real_time else "lockstep"
+        _print_header(console, replace(subject, spec=f"docking {args.scenario or ''}".strip()), args, view, pace)
+        if args.direct:
+            outcome = _run_direct(args, _open(args, subject.spec), view, math.inf, console)
+        else:
+            links = _links(args.connect, free_endpoint())
+            speed = [] if args.real_time else ["--speed", "max"]
+            with _plan(args, subject, view, links, speed, lossless=not args.real_time) as plan:
+                outcome = _run(plan, subject, args.out, console)
+        if (code := _conclude(args.out, subject, outcome, console)) != 0:
+            return code
+        docking = report_docking(args.out / "run.mcap", scenario)
+        (args.out / DOCKING).write_text(docking.model_dump_json(indent=2) + "\n")
+        print_docking(docking, console)
+    if not docking.docked:
+        raise ValueError(f"not docked: the flight ended in {docking.end}, {docking.closest_m:.2f} m away at the least")
+    return 0
+
+
+@contextlib.contextmanager
+def _scenario_file(scenario: DockScenario) -> Iterator[Path]:
+    """Yield a file that holds a scenario, for as long as the run lasts."""
+    with tempfile.TemporaryDirectory(prefix="relnav-") as directory:
+        path = Path(directory) / "scenario.json"
+        path.write_text(scenario.to_json())
+        yield path
 
 
 def _console() -> Console:
@@ -181,7 +227,8 @@ def _plan(
 
 
 def _print_header(console: Console, subject: Subject, args: argparse.Namespace, view: View, how: str) -> None:
-    frames = "live" if subject.frame_count is None else f"{subject.frame_count} frames"
+    endless = "live" if subject.live else "closed loop"
+    frames = endless if subject.frame_count is None else f"{subject.frame_count} frames"
     console.print(f"[bold]{escape(subject.spec)}[/bold]: {frames}, {how}, results in {escape(str(args.out))}")
     if view == "native":
         console.print("Rerun's window opens beside this")

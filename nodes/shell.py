@@ -139,7 +139,7 @@ class Shell:
     def _turn(self, timeout_s: float) -> bool:
         event = self._bus.mailbox.get(timeout_s)
         match event:
-            case Received():
+            case Received() if not self._done:  # afterwards comes nothing but others' health
                 self._take(event)
             case Presence(node=node, alive=True):
                 self._present.add(node)

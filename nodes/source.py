@@ -3,6 +3,8 @@
 Replay: a few frames in flight, at most ``WINDOW`` ahead of what every companion has acknowledged.
 Live: frames when they are due, never waiting for anybody.  A recording played live is retimed, as if the
 camera looked at it now, and what is overdue is left out.
+Closed loop: a simulator that flies on the states of its own frames, which come back over the bus; in lockstep as a
+replay with two frames in flight, or in real time.
 """
 
 from __future__ import annotations
@@ -15,12 +17,12 @@ from typing import Protocol
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
-from nodes.bus import Bus, Credit, Presence
+from nodes.bus import Bus, Credit, Presence, Received
 from nodes.health import Health
 from nodes.processes import process_named
 from nodes.shell import JOIN_PATIENCE_S, POLL_S, NodeError, NodeOptions, StopSignal
 from schemas import CodecError, Envelope, Stamp, Truth, encode
-from schemas.topics import CALIBRATION, FRAME
+from schemas.topics import CALIBRATION, FRAME, STATE
 
 WINDOW = 8
 """Frames in flight in a replay: enough to keep every node busy, few enough to bound memory and latency."""
@@ -37,8 +39,22 @@ class Frames(Protocol):
         """Tell whether it is a camera, which sets the pace itself."""
         ...
 
+    @property
+    def closed_loop(self) -> bool:
+        """Tell whether it flies on the states of its own frames."""
+        ...
+
+    @property
+    def waits(self) -> bool:
+        """Tell whether a closed loop cannot go on before another state has been written to it."""
+        ...
+
     def envelopes(self) -> Iterator[Envelope]:
         """Yield the calibration, then frame by frame."""
+        ...
+
+    def write(self, envelope: Envelope, t_receipt_ns: int) -> None:
+        """Take a state back."""
         ...
 
 
@@ -72,10 +88,14 @@ class SourceNode:
 
     def run(self) -> None:
         """Publish, then wait to be stopped.  Raises NodeError when a replay cannot go on."""
+        if self._source.closed_loop:
+            self._bus.subscribe([STATE])
         self._bus.watch(self._options.companions)
         self._await_companions()
         self._bus.announce()
-        if self._source.live:
+        if self._source.closed_loop:
+            self._run_closed_loop()
+        elif self._source.live:
             self._run_camera()
         elif self._options.lossless:
             self._run_replay()
@@ -147,6 +167,22 @@ class SourceNode:
             self._publish(replace(envelope, stamp=stamp))
             self._turn(0.0)
 
+    def _run_closed_loop(self) -> None:
+        if self._pace.resume is not None:
+            raise NodeError("the simulator died, and a flight cannot be taken up again")
+        for envelope in self._source.envelopes():
+            if self._source.live:
+                self._wait_until(time.monotonic() + (envelope.stamp.t_capture_ns - time.time_ns()) / NS_PER_S)
+            elif envelope.topic is FRAME:
+                self._await_credit(envelope.stamp.sequence)
+            if self._stop.is_set():
+                return
+            self._publish(envelope)
+            if self._options.lossless and envelope.topic is CALIBRATION:
+                self._await_latched()
+            elif not self._turn_until(lambda: not self._source.waits, STALL_PATIENCE_S) and not self._stop.is_set():
+                raise NodeError(f"no state for {STALL_PATIENCE_S:.0f} s after frame {envelope.stamp.sequence}")
+
     def _publish(self, envelope: Envelope) -> None:
         stamp = replace(envelope.stamp, t_origin_ns=time.time_ns())
         self._bus.publish(replace(envelope, stamp=stamp))
@@ -195,6 +231,8 @@ class SourceNode:
 
     def _turn(self, timeout_s: float) -> None:
         match self._bus.mailbox.get(timeout_s):
+            case Received(envelope=envelope, t_receipt_ns=t_receipt_ns):
+                self._source.write(envelope, t_receipt_ns)
             case Presence(node=node, alive=True) if node in self._absent:
                 self._absent.discard(node)
                 self._credits[node] = Credit(node)

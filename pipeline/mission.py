@@ -6,9 +6,10 @@ every node.  Frames and units as in ``schemas``; every field has a default that 
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import yaml
@@ -26,6 +27,31 @@ class Section(BaseModel):
     """Base of all sections: closed, immutable, finite."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+S = TypeVar("S", bound=Section)
+
+
+def parse_sections(kind: type[S], text: str | bytes, *, source: str) -> S:
+    """Read sections from YAML or JSON text.  Raises ValueError that names the source and the field."""
+    try:
+        data: Any = yaml.safe_load(text)
+        return kind.model_validate(data if data is not None else {})
+    except yaml.YAMLError as error:
+        raise ValueError(f"{source} is not YAML or JSON: {' '.join(str(error).split())}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "the file"
+        raise ValueError(f"{source}: {where}: {first['msg']}") from error
+
+
+def read_sections(kind: type[S], path: str | Path, *, what: str) -> S:
+    """Read sections from a file.  Raises ValueError when it cannot be read or is not valid."""
+    try:
+        text = Path(path).read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"cannot read {what} {path}: {error}") from error
+    return parse_sections(kind, text, source=f"{what} {path}")
 
 
 class PoseSection(Section):
@@ -86,13 +112,42 @@ class CameraSection(Section):
     """How pixel values follow light: edges are located in linear light."""
 
 
+class DockingBoxSection(Section):
+    """What the ports must keep to at contact.
+
+    Source: International Docking System Standard, revision F, table of initial contact conditions.
+    """
+
+    closing_speed_m_s: tuple[float, float] = (0.05, 0.10)
+    lateral_speed_m_s: float = Field(default=0.04, gt=0)
+    angular_rate_rad_s: float = Field(default=float(np.deg2rad(0.20)), gt=0)
+    lateral_m: float = Field(default=0.10, gt=0)
+    angle_rad: float = Field(default=float(np.deg2rad(4.0)), gt=0)
+    """Of pitch and yaw together, and of roll."""
+
+
 class CorridorSection(Section):
     """The approach corridor: a cone about the target port's outward axis, with its apex behind the port."""
 
     half_angle_rad: float = Field(default=float(np.deg2rad(10.0)), gt=0, lt=np.pi / 2)
     start_m: float = Field(default=1.5, gt=0)
+    stop_m: float = Field(default=0.0, ge=0)
+    """Axial distances between which the corridor is drawn and flown."""
     port_radius_m: float = Field(default=0.02, ge=0)
     """Radius of the corridor at the port itself."""
+    hold_points_m: tuple[Annotated[float, Field(gt=0)], ...] = ()
+    """Axial distances at which an approach waits for a go, farthest first."""
+    keep_out_radius_m: float = Field(default=200.0, ge=0)
+    """Sphere about the target's origin that is entered through the corridor only; the space station's by default."""
+    docking_box: DockingBoxSection = DockingBoxSection()
+
+    @model_validator(mode="after")
+    def _in_order(self) -> CorridorSection:
+        if any(near >= far for far, near in itertools.pairwise(self.hold_points_m)):
+            raise ValueError(f"hold_points_m must come farthest first, got {list(self.hold_points_m)}")
+        if self.stop_m >= self.start_m:
+            raise ValueError(f"stop_m {self.stop_m} must be nearer than start_m {self.start_m}")
+        return self
 
 
 class FilterSection(Section):
@@ -146,24 +201,12 @@ class Mission(Section):
     @classmethod
     def parse(cls, text: str | bytes, *, source: str) -> Mission:
         """Read a mission from YAML or JSON text.  Raises ValueError that names the source and the field."""
-        try:
-            data: Any = yaml.safe_load(text)
-            return cls.model_validate(data if data is not None else {})
-        except yaml.YAMLError as error:
-            raise ValueError(f"mission {source} is not YAML or JSON: {' '.join(str(error).split())}") from error
-        except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"]) or "the file"
-            raise ValueError(f"mission {source}: {where}: {first['msg']}") from error
+        return parse_sections(cls, text, source=f"mission {source}")
 
     @classmethod
     def load(cls, path: str | Path) -> Mission:
         """Read a mission file.  Raises ValueError when it cannot be read or is not valid."""
-        try:
-            text = Path(path).read_text()
-        except (OSError, UnicodeDecodeError) as error:
-            raise ValueError(f"cannot read mission {path}: {error}") from error
-        return cls.parse(text, source=str(path))
+        return read_sections(cls, path, what="mission")
 
     def to_json(self) -> str:
         """Return what the mission says as indented JSON, which ``parse`` reads back unchanged.

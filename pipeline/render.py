@@ -150,7 +150,7 @@ def lay_texture(
     total = np.zeros_like(behind)
     T_print_cam = inverse(T_cam_print)
     for dx, dy in ray_lattice(samples):
-        x, y, stretch, seen = _hit_print(surface, T_print_cam, rays + dx * right + dy * down)
+        x, y, stretch, seen = hit_print(surface, T_print_cam, rays + dx * right + dy * down)
         if not seen.any():
             total += behind
             continue
@@ -163,7 +163,7 @@ def lay_texture(
     return light
 
 
-def _hit_print(surface: Surface, T_marker_cam: Array, rays: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+def hit_print(surface: Surface, T_marker_cam: Array, rays: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
     """Return where rays (H, W, 2) meet a surface on its outside.
 
     Gives print coordinates x and y, the square root of the surface area a unit of solid ray area covers, and whether

@@ -42,9 +42,9 @@ def replay_direct(
     on_refused: Callable[[str], None] = lambda reason: None,
     steps: Sequence[StepSpec] = STEPS,
 ) -> ReplayCounts:
-    """Run a source through the steps into the sinks; ``on_frame`` is called when a frame is through, ``on_refused``
-    with the reason when a step cannot use a message.
+    """Run a source through the steps into the sinks, and back to the source, which may fly on it.
 
+    ``on_frame`` is called when a frame is through, ``on_refused`` with the reason when a step cannot use a message.
     ``speed`` is a multiple of the recorded pace.  The sinks stay open: they are the caller's.
     """
     counts = ReplayCounts()
@@ -53,13 +53,14 @@ def replay_direct(
         counts.refused += 1
         on_refused(reason)
 
+    every_sink: tuple[Sink, ...] = (*sinks, source)
     built = [(spec, spec.build(source.mission)) for spec in steps]
     for envelope in paced(source.envelopes(), speed):
         entered = replace(envelope, stamp=replace(envelope.stamp, t_origin_ns=time.time_ns()))
         queue = deque([entered])
         while queue:
             current = queue.popleft()
-            for sink in sinks:
+            for sink in every_sink:
                 try:
                     sink.write(current, time.time_ns())
                 except CodecError as error:

@@ -112,6 +112,8 @@ class Summary(Section):
     """States whose covariance is not positive definite."""
     modes: dict[str, float]
     """Seconds spent in each mode."""
+    outside_corridor_s: float | None = None
+    """Time in which states put the chaser inside the keep-out sphere and outside the corridor."""
     latency_ms: Latency
     dropped: int
     """Frames, by their sequence numbers, that no state followed."""
@@ -150,6 +152,7 @@ def score_run(run: Run) -> Summary:
         states_wrong=sum(_is_wrong(row) for row in scored) if run.has_truth else None,
         covariances_invalid=sum(row.covariance_valid is False for row in run.rows),
         modes=seconds_by_mode(run.modes),
+        outside_corridor_s=_outside_corridor_s(run.rows),
         latency_ms=_latency(run.rows),
         dropped=_dropped(run.rows),
         rejections=_counts(reason.split(":")[0] for state in states for reason in state.rejections),
@@ -224,6 +227,15 @@ def seconds_by_mode(modes: Sequence[tuple[float, Mode]]) -> dict[str, float]:
     return seconds
 
 
+def _outside_corridor_s(rows: Sequence[Row]) -> float | None:
+    """Return for how long states were where no chaser may be; None when none tells where it was."""
+    ports = [(row.t_s, row.state.port) for row in rows if row.state is not None and row.state.port is not None]
+    if len(ports) < 2:
+        return None
+    period_s = float(np.median(np.diff([t_s for t_s, _ in ports])))
+    return period_s * sum(port.in_keep_out_sphere and not port.in_corridor for _, port in ports)
+
+
 def _latency(rows: Sequence[Row]) -> Latency:
     latencies_ms = [row.latency_s * 1e3 for row in rows if row.latency_s is not None]
     if not latencies_ms:
@@ -286,6 +298,7 @@ def _table_rows(s: Summary) -> list[tuple[str, str]]:
         ("identities", "" if s.wrong_identities is None else f"{s.wrong_identities} wrong{false}"),
         ("range", "" if s.range_m.first is None else f"{s.range_m.first:.3f} m to {s.range_m.last:.3f} m"),
         ("seconds by mode", ", ".join(f"{name} {t_s:.1f}" for name, t_s in s.modes.items() if t_s > 0)),
+        ("outside the corridor", f"{s.outside_corridor_s:.1f} s" if s.outside_corridor_s else ""),
         ("error, rms", _accuracy_text(s.position_rms_m, None, s.attitude_rms_rad) + wrong),
     ]
     if s.bands is not None:

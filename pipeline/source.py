@@ -39,6 +39,12 @@ class SourceOptions:
     scale_camera: bool = False
     """The picture was only resized: scale a calibration of another size instead of refusing it."""
 
+    def refuse(self, why: str, **given: object) -> None:
+        """Raise SourceError, with the reason, when one of these options is given to a source that cannot heed it."""
+        for name, value in given.items():
+            if value is not None:
+                raise SourceError(f"--{name} cannot be given here: {why}")
+
 
 class Source(ABC):
     """Frames in order, with what is known about their camera.
@@ -48,6 +54,8 @@ class Source(ABC):
     """
 
     live = False
+    closed_loop = False
+    """It flies on the states of its own frames: they are to be written to it."""
 
     def __init__(self, mission: Mission, calibration: CameraCalibration, frame_count: int | None):
         self.mission = mission
@@ -61,6 +69,17 @@ class Source(ABC):
     @abstractmethod
     def envelopes(self) -> Iterator[Envelope]:
         """Yield the calibration, then frames, each after its truth; ``t_origin_ns`` is 0."""
+
+    @property
+    def waits(self) -> bool:
+        """Tell whether a closed loop cannot go on before another state has been written to it."""
+        return False
+
+    def write(self, envelope: Envelope, t_receipt_ns: int) -> None:  # noqa: B027
+        """Take what the pipeline made of the frames so far; of use to a closed loop only."""
+
+    def close(self) -> None:  # noqa: B027
+        """Nothing to finish."""
 
     def _warn(self, line: str) -> None:
         if line not in self.warnings:

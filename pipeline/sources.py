@@ -11,6 +11,7 @@ import re
 from pathlib import Path
 
 from pipeline.camera_device import OpenCvDevice
+from pipeline.mission import Mission
 from pipeline.picture_sources import IMAGE_SUFFIXES, CameraSource, FolderSource, VideoSource
 from pipeline.recording import MAGIC
 from pipeline.recording_source import RecordingSource
@@ -29,7 +30,8 @@ def open_source(
     fps: float | None = None,
     scale_camera: bool = False,
 ) -> Source:
-    """Open a recording, a video, a folder of images, an image, or a camera ("v4l2:/dev/video0", "/dev/video0", "0").
+    """Open a recording, a video, a folder of images, an image, a camera ("v4l2:/dev/video0", "/dev/video0", "0"), a
+    simulated camera ("sim", "sim:scenario.yaml") or a docking in closed loop ("dock", "dock:scenario.yaml").
 
     ``camera`` is a calibration file, ``mission`` a mission file; both win over recorded ones.  Raises ValueError
     with one line when the source does not exist, is empty, or cannot be read, and when the calibration is for
@@ -38,6 +40,9 @@ def open_source(
     if fps is not None and not fps > 0:
         raise SourceError(f"the frame rate must be positive, got {fps}")
     options = SourceOptions(camera, mission, fps, scale_camera)
+    kind, _, scenario = str(spec).partition(":")
+    if kind in _SIMULATED and not Path(spec).exists():
+        return _SIMULATED[kind](Path(scenario) if scenario else None, options)
     path = Path(spec)
     device = _DEVICE.fullmatch(str(spec))
     if device and not path.is_file() and not path.is_dir():
@@ -54,6 +59,27 @@ def open_source(
     if path.suffix.lower() == ".mcap" or _begins_like_mcap(path):
         return RecordingSource(path, options)
     return VideoSource(path, options)
+
+
+def _simulated_camera(scenario: Path | None, options: SourceOptions) -> Source:
+    from pipeline.sim_source import SimScenario, SimSource
+
+    options.refuse("the scenario of a simulated camera holds it", camera=options.camera)
+    seen = SimScenario() if scenario is None else SimScenario.load(scenario)
+    if options.mission is not None:
+        seen = SimScenario.model_validate({**dict(seen), "mission": Mission.load(options.mission)})
+    return SimSource(seen, fps=options.fps)
+
+
+def _docking(scenario: Path | None, options: SourceOptions) -> Source:
+    from pipeline.dock import DockSource
+    from pipeline.dock_scenario import DockScenario
+
+    options.refuse("the scenario of a docking holds it", camera=options.camera, fps=options.fps)
+    return DockSource(DockScenario() if scenario is None else DockScenario.load(scenario))
+
+
+_SIMULATED = {"sim": _simulated_camera, "dock": _docking}
 
 
 def _begins_like_mcap(path: Path) -> bool:

@@ -144,6 +144,13 @@ class PortToPort(Message):
     corridor_angle_rad: float = number(8)
     """Angle of the line of sight off the target port's axis."""
     in_corridor: bool = number(9)
+    in_keep_out_sphere: bool = number(10, default=False)
+    hold_point_m: float | None = number(11, default=None)
+    """Axial distance of the next hold point ahead; absent when there is none."""
+    in_docking_box: bool = number(12, default=False)
+    """Contact now would be within the docking box."""
+    axial_closing_speed_m_s: float = number(13, default=0.0)
+    """Along the target port's axis, positive when closing."""
 
 
 class RelativeState(Message):
@@ -179,6 +186,40 @@ class Truth(Message):
     T_chaser_target: Pose = number(2)
     v_chaser_target_m_s: Vector3 = number(3)
     omega_chaser_target_in_target_rad_s: Vector3 = number(4)
+
+
+class Phase(IntEnum):
+    """What the chaser's guidance is doing."""
+
+    ACQUIRE = 0
+    """Waiting for a state to fly on."""
+    APPROACH = 1
+    HOLD_POINT = 2
+    """Waiting at a hold point of the corridor, as planned."""
+    HOLD = 3
+    """Standing still because the state is not to be flown on."""
+    RETREAT = 4
+    SAFE = 5
+    """Standing still after a retreat."""
+    CONTACT = 6
+
+
+class Guidance(Message):
+    """What the chaser's guidance knows and commands; the command holds until the next one."""
+
+    t_capture_ns: int = number(1)
+    phase: Phase = number(2)
+    reason: str = number(3)
+    """For being in this phase."""
+    navigation_age_s: float | None = number(4, default=None)
+    """Since the last state that was flown on."""
+    position_sigma_m: float = number(5)
+    p_targetport_chaserport_m: Vector3 = number(6)
+    v_targetport_chaserport_m_s: Vector3 = number(7)
+    force_chaser_n: Vector3 = number(8)
+    torque_chaser_n_m: Vector3 = number(9)
+    delta_v_m_s: float = number(10)
+    """Spent since the start, as it was delivered."""
 
 
 class NodeHealth(Message):

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from astratag.transforms import exp_so3, pose, wxyz_from_rotation
-from pipeline.corridor import in_corridor, port_to_port
-from pipeline.mission import CorridorSection, Mission, PoseSection
+from pipeline.corridor import box_violations, in_corridor, next_hold_point_m, port_to_port
+from pipeline.mission import CorridorSection, DockingBoxSection, Mission, PoseSection
 from schemas import PortToPort
 
 FACING = np.diag([1.0, -1.0, -1.0])
@@ -113,3 +113,49 @@ def test_speeds_are_rates_of_change(position, theta, v, omega, chaser_port, targ
 
     rate = (later(h).range_m - later(-h).range_m) / (2 * h)
     assert later(0).closing_speed_m_s == pytest.approx(-rate, abs=1e-6)
+
+
+def test_the_keep_out_sphere_is_about_the_target_not_its_port():
+    mission = Mission(
+        T_target_port=PoseSection(translation_m=(0.0, 0.0, 2.0)), corridor=CorridorSection(keep_out_radius_m=5.0)
+    )
+    assert not at((0, 0, 5.5), mission=mission).in_keep_out_sphere
+    assert at((0, 0, 4.5), mission=mission).in_keep_out_sphere
+
+
+@pytest.mark.parametrize(("axial_m", "ahead_m"), [(25.0, 20.0), (20.0, 20.0), (19.9, 2.0), (1.9, None)])
+def test_the_next_hold_point_is_the_nearest_one_ahead(axial_m, ahead_m):
+    assert next_hold_point_m(CorridorSection(hold_points_m=(20.0, 2.0)), axial_m) == ahead_m
+
+
+def test_hold_points_come_farthest_first():
+    with pytest.raises(ValueError, match="farthest first"):
+        CorridorSection(hold_points_m=(2.0, 20.0))
+    with pytest.raises(ValueError, match="must be nearer than start_m"):
+        CorridorSection(stop_m=2.0)
+
+
+GOOD = {"R_chaser_target": FACING, "v": (0.0, 0.0, -0.07)}
+TILTED, ROLLED = (FACING @ exp_so3(np.deg2rad(5.0) * np.array(axis)) for axis in ((1, 0, 0), (0, 0, 1)))
+
+
+@pytest.mark.parametrize(
+    ("contact", "broken"),
+    [
+        (GOOD, []),
+        (GOOD | {"v": (0.0, 0.0, -0.04)}, ["closing speed"]),
+        (GOOD | {"v": (0.0, 0.0, -0.11)}, ["closing speed"]),
+        (GOOD | {"v": (0.05, 0.0, -0.07)}, ["lateral speed"]),
+        (GOOD | {"t_chaser_target": (0.11, 0.0, 0.0)}, ["lateral"]),
+        (GOOD | {"R_chaser_target": TILTED}, ["misalignment"]),
+        (GOOD | {"R_chaser_target": ROLLED}, ["roll"]),
+        (GOOD | {"omega": (0.0, 0.0, np.deg2rad(0.3))}, ["angular rate"]),
+    ],
+)
+def test_the_docking_box_is_the_standards(contact, broken):
+    """International Docking System Standard: each limit by itself, and the flag of the state with it."""
+    port = at(**({"t_chaser_target": (0.0, 0.0, 0.0)} | contact))
+    rate_rad_s = float(np.linalg.norm(contact.get("omega", STILL)))
+    violations = box_violations(DockingBoxSection(), port, rate_rad_s)
+    assert [line[: len(name)] for line, name in zip(violations, broken, strict=True)] == broken
+    assert port.in_docking_box == (not broken)

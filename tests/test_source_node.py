@@ -4,15 +4,16 @@ import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 
+import pytest
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
 from nodes import source as source_module
-from nodes.bus import Credit, Event, Presence
-from nodes.shell import NodeOptions
+from nodes.bus import Credit, Event, Presence, Received
+from nodes.shell import NodeError, NodeOptions
 from nodes.source import WINDOW, Pace, Resume, SourceNode, repeated, retimed
 from pipeline.mission import Mission
 from schemas import Envelope, Pose, Quaternion, Stamp, Truth, Vector3, encode
-from schemas.topics import CALIBRATION, FRAME, TRUTH
+from schemas.topics import CALIBRATION, FRAME, STATE, TRUTH
 
 PERIOD_NS = 50_000_000
 START_NS = 1_000_000_000_000
@@ -79,10 +80,16 @@ class Others:
         """Frames published, and those acknowledged by all, at each calibration."""
         self.acknowledged = dict.fromkeys(names, -1)
         self.latched = 0
+        self.answers_with_states = False
+        self.states = 0
 
     def get(self, timeout_s: float) -> Event | None:
         if self.events:
             return self.events.pop(0)
+        if self.answers_with_states and self.states < len(self.published):
+            self.states += 1
+            stamp = Stamp(self.states - 1, 0, 0)
+            return Received(Envelope(STATE, "relnav/chaser/state", b"", stamp), 0)
         behind = min(self.names, key=self.acknowledged.__getitem__)
         if self.acknowledged[behind] < len(self.published) - 1:
             self.acknowledged[behind] += 1
@@ -90,6 +97,8 @@ class Others:
         return None
 
     def watch(self, nodes: object) -> None: ...
+
+    def subscribe(self, topics: object) -> None: ...
 
     def announce(self) -> None: ...
 
@@ -113,6 +122,7 @@ class Film:
     """A source of frames in memory."""
 
     live = False
+    closed_loop = False
 
     def __init__(self, frames: int):
         self.frames = frames
@@ -149,6 +159,48 @@ def test_a_calibration_that_changes_finds_everybody_at_the_same_frame():
 def test_a_damaged_message_is_passed_on_for_the_detector_to_refuse():
     damaged = Envelope(FRAME, "f", b"\xff\xff\xff", Stamp(4, 5, 6))
     assert retimed(damaged, 7) == Envelope(FRAME, "f", b"\xff\xff\xff", Stamp(4, 7, 6))
+
+
+class Loop(Film):
+    """A closed loop that makes a frame for every state that is written to it, and is one ahead."""
+
+    closed_loop = True
+
+    def __init__(self, frames: int):
+        super().__init__(frames)
+        self.written = 0
+        self.made = 0
+
+    @property
+    def waits(self) -> bool:
+        return self.written < self.made - 1
+
+    def write(self, envelope: Envelope, t_receipt_ns: int) -> None:
+        self.written += 1
+
+    def envelopes(self) -> Iterator[Envelope]:
+        for envelope in recording(self.frames):
+            assert not self.waits
+            self.made += envelope.topic is FRAME
+            yield envelope
+
+
+def test_a_closed_loop_waits_for_the_states_of_its_own_frames():
+    """Each frame goes out when the state of the one before the last is back."""
+    others = Others(("detector", "recorder"))
+    others.answers_with_states = True
+    loop = Loop(30)
+    options = NodeOptions(Mission(), True, others.names)
+    SourceNode(loop, Pace(speed=None), options, others, others).run()  # type: ignore[arg-type]
+    assert [envelope.stamp.sequence for envelope in others.published] == list(range(30))
+    assert loop.written >= 29
+
+
+def test_a_flight_is_not_taken_up_again_after_the_simulator_died():
+    options = NodeOptions(Mission(), False, ())
+    others = Others(("detector",))
+    with pytest.raises(NodeError, match="cannot be taken up again"):
+        SourceNode(Loop(3), Pace(resume=Resume(3, 0)), options, others, others).run()  # type: ignore[arg-type]
 
 
 def test_a_viewer_that_dies_is_not_waited_for():

@@ -105,9 +105,27 @@ def corridor_strips(corridor: CorridorSection) -> list[Array]:
         radius_m = corridor.port_radius_m + z_m * slope
         return np.stack([radius_m * np.cos(angles), radius_m * np.sin(angles), np.full_like(angles, z_m)], axis=-1)
 
-    near, far = ring(0.0), ring(corridor.start_m)
-    rings = [ring(z_m) for z_m in np.linspace(0.0, corridor.start_m, 4)]
+    near, far = ring(corridor.stop_m), ring(corridor.start_m)
+    rings = [ring(z_m) for z_m in np.linspace(corridor.stop_m, corridor.start_m, 4)]
     return rings + [np.stack([near[k], far[k]]) for k in range(0, SECTORS, SECTORS // 8)]
+
+
+def hold_point_strips(corridor: CorridorSection) -> list[Array]:
+    """Return the hold points as squares across the corridor (5, 3) in the port frame, each touching its cone."""
+    square = np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (1.0, 1.0)]) / np.sqrt(2.0)
+    slope = np.tan(corridor.half_angle_rad)
+    return [
+        np.column_stack([(corridor.port_radius_m + z_m * slope) * square, np.full(len(square), z_m)])
+        for z_m in corridor.hold_points_m
+    ]
+
+
+def keep_out_strips(corridor: CorridorSection, T_target_port: Array) -> list[Array]:
+    """Return three great circles (N, 3) of the keep-out sphere about the target's origin, in the port frame."""
+    angles = np.linspace(0.0, 2 * np.pi, SECTORS + 1)
+    circle = corridor.keep_out_radius_m * np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1)
+    centre = inverse(T_target_port)[:3, 3]
+    return [centre + np.roll(circle, shift, axis=1) for shift in range(3)]
 
 
 def corridor_mesh(corridor: CorridorSection) -> Mesh:

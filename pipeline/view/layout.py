@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.mission import CorridorSection
 from pipeline.view.geometry import ELLIPSOID_SCALE, SIGMAS
-from schemas import Mode
+from schemas import Mode, Phase
 
 Array = NDArray[np.float64]
 
@@ -28,6 +28,7 @@ OVERLAY = f"{CAMERA}/overlay"
 PATHS = (f"{ESTIMATE}/path", f"{TRUTH}/path")
 STATUS = "status"
 MODE, LARGEST_LAYER, IN_CORRIDOR = f"{STATUS}/filter_mode", f"{STATUS}/largest_layer", f"{STATUS}/corridor"
+GUIDANCE_PHASE = f"{STATUS}/guidance"
 
 ESTIMATE_COLOR, TRUTH_COLOR, BOUND_COLOR, CORRIDOR_COLOR = 0x4CB8FFFF, 0x8CE05AFF, 0x8B93A3FF, 0x9B7BFFFF
 ALARM_COLOR, NOTHING_COLOR, GRID_COLOR, BODY_COLOR = 0xFF4040FF, 0x3A3F4AFF, 0xFFFFFF50, 0x5A6475FF
@@ -40,6 +41,16 @@ MODE_COLORS = {
     Mode.TRACK: ESTIMATE_COLOR,
     Mode.COAST: 0xFFB020FF,
     Mode.LOST: ALARM_COLOR,
+}
+
+PHASE_COLORS = {
+    Phase.ACQUIRE: 0x6B7280FF,
+    Phase.APPROACH: ESTIMATE_COLOR,
+    Phase.HOLD_POINT: CORRIDOR_COLOR,
+    Phase.HOLD: 0xFFB020FF,
+    Phase.RETREAT: ALARM_COLOR,
+    Phase.SAFE: 0xC77DFFFF,
+    Phase.CONTACT: TRUTH_COLOR,
 }
 
 PLOTS = (
@@ -107,6 +118,9 @@ def status_styles() -> dict[str, rr.StateConfiguration]:
     """Return the colours of each lane of the status."""
     return {
         MODE: rr.StateConfiguration(values=[mode.name for mode in Mode], colors=rgba(MODE_COLORS.values())),
+        GUIDANCE_PHASE: rr.StateConfiguration(
+            values=[phase.name for phase in Phase], colors=rgba(PHASE_COLORS.values())
+        ),
         LARGEST_LAYER: rr.StateConfiguration(
             values=[*LAYER_NAMES, "none"], colors=rgba((*LAYER_COLORS, NOTHING_COLOR))
         ),

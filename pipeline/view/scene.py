@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -13,8 +14,16 @@ from astratag.dictionary import Dictionary
 from astratag.geometry import QUIET_MARGIN
 from astratag.surface import Surface
 from pipeline.mission import CorridorSection
-from pipeline.view.geometry import Mesh, corridor_mesh, corridor_strips, print_mesh, target_bodies
-from pipeline.view.layout import BODY_COLOR, CORRIDOR_COLOR, SCENE, faint
+from pipeline.view.geometry import (
+    Mesh,
+    corridor_mesh,
+    corridor_strips,
+    hold_point_strips,
+    keep_out_strips,
+    print_mesh,
+    target_bodies,
+)
+from pipeline.view.layout import ALARM_COLOR, BODY_COLOR, CORRIDOR_COLOR, SCENE, faint
 
 Array = NDArray[np.float64]
 Log = Callable[..., None]
@@ -22,6 +31,8 @@ Log = Callable[..., None]
 Mounted = tuple[int, Array, float, Surface]
 """A marker on the target: id, T_target_marker, side in metres, surface."""
 
+LARGEST_SPHERE = 5.0
+"""A keep-out sphere is drawn when its radius is at most so many lengths of the corridor: the scene stays in sight."""
 CHASER_M = (0.11, 0.11, 0.13)
 """The chaser as drawn: width, height, and depth behind its docking port."""
 
@@ -43,14 +54,20 @@ def draw_target(log: Log, markers: Sequence[Mounted], dictionary: Dictionary) ->
         log(f"{SCENE}/target/marker_{marker_id}", transform3d(T_target_marker), drawn, static=True)
 
 
-def draw_corridor(log: Log, corridor: CorridorSection) -> None:
-    """Draw the approach corridor as a veil with edges."""
+def draw_corridor(log: Log, corridor: CorridorSection, T_target_port: Array) -> None:
+    """Draw the approach corridor as a veil with edges, its hold points, and a keep-out sphere of a like size."""
     veil = _mesh3d(corridor_mesh(corridor), color=faint(CORRIDOR_COLOR, 0x18))
     edges = rr.LineStrips3D(
         corridor_strips(corridor), colors=faint(CORRIDOR_COLOR, 0x90), radii=rr.Radius.ui_points(0.6)
     )
     log(f"{SCENE}/corridor", veil, static=True)
     log(f"{SCENE}/corridor/edges", edges, static=True)
+    thin: dict[str, Any] = {"colors": faint(CORRIDOR_COLOR, 0xD0), "radii": rr.Radius.ui_points(1.0)}
+    if corridor.hold_points_m:
+        log(f"{SCENE}/corridor/hold_points", rr.LineStrips3D(hold_point_strips(corridor), **thin), static=True)
+    if 0 < corridor.keep_out_radius_m <= LARGEST_SPHERE * corridor.start_m:
+        sphere = rr.LineStrips3D(keep_out_strips(corridor, T_target_port), colors=faint(ALARM_COLOR, 0x60))
+        log(f"{SCENE}/keep_out_sphere", sphere, static=True)
 
 
 def draw_vehicle(log: Log, path: str, T_chaser_port: Array, *, color: int, width: float, size: float = 1.0) -> None:

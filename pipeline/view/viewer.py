@@ -26,8 +26,8 @@ from pipeline.view.geometry import ELLIPSOID_SCALE, SIGMAS, PortMotion, chaser_p
 from pipeline.view.overlay import Overlay
 from pipeline.view.scene import draw_corridor, draw_target, draw_vehicle, transform3d
 from pipeline.view.streams import LOCALHOST, Live, Warn, Window, open_file, serve_web
-from schemas import Detections, Envelope, RelativeState, Truth
-from schemas.topics import CALIBRATION, DETECTIONS, EVENTS, FRAME, STATE, TRUTH
+from schemas import Detections, Envelope, Guidance, Phase, RelativeState, Truth
+from schemas.topics import CALIBRATION, DETECTIONS, EVENTS, FRAME, GUIDANCE, STATE, TRUTH
 
 Array = NDArray[np.float64]
 ViewMode = Literal["native", "web", "none"]
@@ -96,6 +96,7 @@ class Viewer:
             DETECTIONS.name: self._draw_detections,
             STATE.name: self._draw_state,
             TRUTH.name: self._draw_truth,
+            GUIDANCE.name: self._draw_guidance,
             EVENTS.name: self._draw_event,
         }
         self._draw_static()
@@ -155,7 +156,7 @@ class Viewer:
             self._log(path, lane, static=True)
         self._log(layout.SCENE, rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
         self._log(f"{layout.SCENE}/target", transform3d(chaser_pose(np.eye(4), self._T_target_port)), static=True)
-        draw_corridor(self._log, self._mission.corridor)
+        draw_corridor(self._log, self._mission.corridor, self._T_target_port)
         markers = [(m.id, m.T_target_marker.matrix(), m.side_m, m.surface.surface()) for m in self._mission.markers]
         draw_target(self._log, markers, load_dictionary(self._mission.dictionary))
         draw_vehicle(self._log, layout.ESTIMATE, self._T_chaser_port, color=layout.ESTIMATE_COLOR, width=1.2)
@@ -288,6 +289,13 @@ class Viewer:
     def _draw_event(self, message: Log, _envelope: Envelope, _t_ns: int) -> None:
         level = LOG_LEVELS.get(message.level, rr.TextLogLevel.INFO)
         self._log("events", rr.TextLog(message.message, level=level))
+
+    def _draw_guidance(self, guidance: Guidance, _envelope: Envelope, _t_ns: int) -> None:
+        if self._changed("phase", guidance.phase):
+            is_alarm = guidance.phase in (Phase.HOLD, Phase.RETREAT, Phase.SAFE)
+            level = rr.TextLogLevel.WARN if is_alarm else rr.TextLogLevel.INFO
+            self._log("events", rr.TextLog(f"{guidance.phase.name}: {guidance.reason}", level=level))
+            self._log(layout.GUIDANCE_PHASE, rr.StateChange(state=guidance.phase.name))
 
     def _draw_status(self, lane: str, status: str) -> None:
         if self._changed(lane, status):
