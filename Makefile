@@ -2,7 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 RUN := $(VENV)/bin
-STAMP := $(VENV)/.synced
+EXTRAS ?=
+STAMP := $(VENV)/.synced$(foreach extra,$(EXTRAS),-$(extra))
 OUT ?= out/replay
 
 export UV_PROJECT_ENVIRONMENT := $(VENV)
@@ -24,8 +25,8 @@ $(STAMP): pyproject.toml uv.lock
 	  uv=.uv/bin/uv; \
 	fi; \
 	echo "setup: $(VENV) from uv.lock"; \
-	"$$uv" sync --quiet --frozen --python $(PYTHON)
-	@touch $@
+	"$$uv" sync --quiet --frozen --python $(PYTHON) $(addprefix --extra ,$(EXTRAS))
+	@rm -f $(VENV)/.synced* && touch $@
 
 replay: $(STAMP) ## Replay the shipped approach corridor, live in Rerun, and score it
 	$(RUN)/relnav replay --out $(OUT) $(ARGS)

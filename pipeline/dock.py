@@ -55,7 +55,7 @@ BuildPlant = Callable[[DockScenario, Departure], Plant]
 def require_basilisk() -> None:
     """Raise ValueError when Basilisk is not installed."""
     if find_spec("Basilisk") is None:
-        raise ValueError("Basilisk is not installed: `uv sync --extra dock` installs it, or `pip install bsk`")
+        raise ValueError("Basilisk is not installed: `make setup EXTRAS=dock` installs it, or `pip install bsk`")
 
 
 def basilisk(scenario: DockScenario, departure: Departure) -> Plant:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("Basilisk", reason="Basilisk is not installed: uv sync --extra dock")
+pytest.importorskip("Basilisk", reason="Basilisk is not installed: make setup EXTRAS=dock")
 
 from astratag.transforms import exp_so3, inverse, rotation_from_wxyz
 from pipeline.basilisk_plant import BasiliskPlant

@@ -23,7 +23,7 @@ EASY = Scene(side_px=150, tilt_deg=(0, 20))
 @pytest.mark.parametrize("entrant", ENTRANTS, ids=lambda entrant: entrant.name)
 def test_reads_its_own_print_where_it_was_laid(entrant: Entrant, size: str):
     if entrant.absent:
-        pytest.skip(f"{entrant.needs} is not installed; uv sync --extra peers")
+        pytest.skip(f"{entrant.needs} is not installed; make setup EXTRAS=peers")
     kind, scene = MARKERS[entrant.marker], draw(EASY, SEED)
     printed = 3 % kind.ids
     seen = entrant.start(scene.surface)(scene.photograph(texture(entrant.marker, printed, size)), scene.camera)

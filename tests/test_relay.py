@@ -191,7 +191,7 @@ def test_a_ros_domain_that_is_no_number_is_refused(bus, monkeypatch):
 
 def test_without_rosbags_the_repair_is_named(bus, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
-    with pytest.raises(ValueError, match="uv sync --extra ros2"):
+    with pytest.raises(ValueError, match="make setup EXTRAS=ros2"):
         opened("ros2", bus)
 
 

@@ -147,7 +147,7 @@ def main() -> None:
     entrants = tuple(entrant for entrant in ENTRANTS if not entrant.absent)
     for entrant in ENTRANTS:
         if entrant.absent:
-            CONSOLE.print(f"{entrant.name}: left out, {entrant.needs} is not installed (uv sync --extra peers)")
+            CONSOLE.print(f"{entrant.name}: left out, {entrant.needs} is not installed (make setup EXTRAS=peers)")
     options.out.mkdir(parents=True, exist_ok=True)
     results: dict[str, object] = {"machine": platform.processor() or platform.machine(), "images": options.images}
     conditions = [condition for condition in CONDITIONS if condition.name in parts]

@@ -79,7 +79,7 @@ class Ros2Encoder:
         try:
             from rosbags.typesys import Stores, get_typestore
         except ImportError as error:
-            raise ValueError("ROS 2 messages need rosbags: run `uv sync --extra ros2`") from error
+            raise ValueError("ROS 2 messages need rosbags: run `make setup EXTRAS=ros2`") from error
         # The two messages and their hashes are the same in every distribution since Dashing.
         self._store = get_typestore(Stores.ROS2_JAZZY)
         self.pose_topic = self._topic(f"relnav/{_ros_name(vehicle)}/target_pose", POSE_TYPE)
