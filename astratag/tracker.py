@@ -11,14 +11,17 @@ from numpy.typing import NDArray
 from astratag.camera import Camera
 from astratag.candidates import OUTER
 from astratag.checks import instance
+from astratag.confirm import COST_LIMIT
+from astratag.describe import ALIGNED_POLISHED_PX
 from astratag.detection import Detection
-from astratag.detector import ALIGNED_POLISHED_PX, COST_LIMIT, EVERY_WAY, HALVE_FROM_PX, Detector, View, surest
+from astratag.detector import EVERY_WAY, HALVE_FROM_PX, Detector, surest
 from astratag.edges import EDGE_LAYER
 from astratag.fit import fit_edges
 from astratag.grow import ALL_EDGES, SETTLED_PX, Fit, grow, layer_side_px, settle
 from astratag.search import COARSE, PLAIN, find_outlines
 from astratag.surface import Flat
 from astratag.transforms import difference, perturb
+from astratag.view import View
 from astratag.warp import HomographyWarp, PoseWarp
 
 Array = NDArray[np.float64]

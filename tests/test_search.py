@@ -4,20 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import ModuleType
 
 import cv2
 import numpy as np
 import pytest
 
+import astratag.confirm
 import astratag.detector
 from astratag import Camera, Detector, Flat, load_dictionary
 from astratag.candidates import Candidate
 from astratag.codes import Reading
-from astratag.detector import MAX_ALIGNED, MAX_BY_EDGES, MAX_MATCHED, outer_corners
+from astratag.describe import outer_corners
+from astratag.detector import MAX_MATCHED
 from astratag.effort import Tries, first_distinct
 from astratag.geometry import LAYERS, TEMPLATE_UNITS, square
 from astratag.search import COARSE, MAX_CONTOURS, NARROW, PLAIN, bent_quads_of, find_outlines, quads_of
 from astratag.transforms import exp_so3, pose
+from astratag.view import MAX_ALIGNED, MAX_BY_EDGES
 from astratag.warp import HomographyWarp, PoseWarp
 from pipeline.render import render_marker
 
@@ -128,9 +132,9 @@ def adversarial(kind: str) -> np.ndarray:
     return cv2.GaussianBlur(image, (0, 0), 0.7)
 
 
-def counting(counts: dict[str, int], name: str) -> Callable:
-    """Return a function of the detector's that counts its calls."""
-    function = getattr(astratag.detector, name)
+def counting(counts: dict[str, int], name: str, module: ModuleType) -> Callable:
+    """Return a function of the detector's modules that counts its calls."""
+    function = getattr(module, name)
 
     def counted(*args, **options):
         counts[name] += 1
@@ -143,9 +147,10 @@ def counting(counts: dict[str, int], name: str) -> Callable:
 @pytest.mark.parametrize("kind", ["noise", "blobs", "board", "JPEG", "squares"])
 def test_no_image_is_looked_at_closely_more_often_than_bounded(kind, surface, monkeypatch):
     """Counts, not clocks: the bounds hold over all ways of telling ink from paper together."""
-    counts = {"find_outlines": 0, "match": 0, "grow": 0}
-    for name in counts:
-        monkeypatch.setattr(astratag.detector, name, counting(counts, name))
+    used_in = {"find_outlines": astratag.detector, "match": astratag.confirm, "grow": astratag.confirm}
+    counts = dict.fromkeys(used_in, 0)
+    for name, module in used_in.items():
+        monkeypatch.setattr(module, name, counting(counts, name, module))
     detector = Detector(surface=surface)
     view = detector.view(
         adversarial(kind), Camera([[300, 0, 160], [0, 300, 120], [0, 0, 1]], width=WIDTH, height=HEIGHT)

@@ -1,0 +1,45 @@
+"""One image as the detector works on it, and how much of that it is worth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from astratag.camera import Camera
+from astratag.checks import picture
+from astratag.cylinder import assumed_camera
+from astratag.effort import Tries
+
+Array = NDArray[np.float64]
+
+MAX_BY_EDGES, MAX_ALIGNED, MAX_CURVED = 12, 8, 12
+"""Candidates in one image whose edges are fitted; that are moved until they look as they read; and so on cylinders."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One image as the detector works on it: gray, in linear light, and with its camera.
+
+    ``by_edges`` and ``aligned`` hold what was looked at closely in it, and end that when it was enough.
+    """
+
+    gray: NDArray[np.uint8]
+    light: NDArray[np.float32]
+    camera: Camera | None
+    by_edges: Tries = field(default_factory=lambda: Tries(MAX_BY_EDGES))
+    aligned: Tries = field(default_factory=lambda: Tries(MAX_ALIGNED))
+    curved: Tries = field(default_factory=lambda: Tries(MAX_CURVED))
+
+    @property
+    def some_camera(self) -> Camera:
+        """Return the camera, or one like most when it is not known: to bend prints with, not for poses."""
+        return self.camera or assumed_camera(self.gray.shape[1], self.gray.shape[0])
+
+
+def as_gray(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return a gray (H, W) or BGR (H, W, 3) image as gray.  Raises ValueError for anything else."""
+    image = picture(image)
+    return np.ascontiguousarray(image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
