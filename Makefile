@@ -3,7 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 RUN := $(VENV)/bin
 EXTRAS ?=
-STAMP := $(VENV)/.synced$(foreach extra,$(EXTRAS),-$(extra))
+EMPTY :=
+STAMP := $(VENV)/.synced$(subst $(EMPTY) $(EMPTY),,$(addprefix -,$(EXTRAS)))
 OUT ?= out/replay
 
 export UV_PROJECT_ENVIRONMENT := $(VENV)

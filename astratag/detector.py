@@ -64,7 +64,7 @@ Array = NDArray[np.float64]
 LEAST_IMAGE_PX = 8
 """Images narrower than this hold no marker that could be read."""
 HALVE_FROM_PX = 500_000
-"""Parts of an image with more pixels than this are searched at half resolution; in whole ones thin borders are first."""
+"""Parts of an image with more pixels than this are searched at half resolution; in whole ones thin borders first."""
 LIKELY = 0.68
 """Correlation through a rough quad from which it is looked at even where surer ones were markers."""
 EVERY_WAY = (PLAIN, NARROW, FAINT)
