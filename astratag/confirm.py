@@ -31,7 +31,7 @@ from astratag.curved import (
     seen_whole,
 )
 from astratag.cylinder import CylinderWarp
-from astratag.describe import ALIGNED_POLISHED_PX, PIXEL_BLUR, SQUARES, WARPS, Describer, inside, lead
+from astratag.describe import ALIGNED_POLISHED_PX, LEAST_POLISHED, PIXEL_BLUR, SQUARES, WARPS, Describer, inside, lead
 from astratag.detection import Detection, LayerDetection
 from astratag.fit import follows_all_sides
 from astratag.geometry import LAYERS, Layer, layer_points, square
@@ -122,6 +122,11 @@ class Confirmer(Describer):
             detection = self.describe(view, marker_id, fit, "cylinder", MANY_WARPS)
             if detection is not None and self._layers_agree(view, detection, fit.warp, looks):
                 return detection
+        by_pixels = self._synthesis.align(view.light, warp, marker_id, PIXEL_BLUR)
+        if by_pixels is not None and by_pixels.correlation > LEAST_POLISHED:
+            return self._described_by_pixels(
+                view, marker_id, by_pixels, seen.layer, seen.reading.correlation, "cylinder"
+            )
         sigma_px = LOOKS_SIGMA_PX + LOOKS_SIGMA * candidate.side_px
         corners = LayerDetection(seen.layer, warp(SQUARES[seen.layer]), sigma_px)
         covariance = covariance_of(warp, layer_points(KNOTS, LAYERS[seen.layer]), sigma_px)

@@ -56,6 +56,7 @@ MOST_LINES, FEWEST_LINES = 32, 12
 """Grid lines across the print: so many that they are ``SPACING_PX`` apart where it looks widest, within bounds."""
 SIGMA_FLOOR_PX = 0.02
 """What a point's standard deviation never falls below: print, lens model, shape of the blur."""
+FINELY_SAMPLED_PX = 64.0
 LEAST_BLUR_PX, MOST_BLUR_PX = 0.5, 8.0
 BLUR_STEP = 0.3
 """How far one step may take the logarithm of the blur, as a standard deviation."""
@@ -95,6 +96,7 @@ def _labels() -> NDArray[np.uint8]:
 
 
 _LABELS = _labels()
+_OUTER = square(0.0, TEMPLATE_UNITS)
 
 
 def _nodes(count: int) -> Array:
@@ -155,11 +157,15 @@ class Look:
         return np.column_stack([np.ones(len(self.weight)), self.template / TEMPLATE_UNITS - 0.5])
 
 
+def _widest_px(warp: FittedWarp) -> float:
+    """Return how long the longest side of a print looks, at least a pixel."""
+    corners = warp(_OUTER)
+    return max(float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).max()), 1.0)
+
+
 def look(warp: FittedWarp, shape: tuple[int, ...], reach: float = REACH) -> Look | None:
     """Return how a print and ``reach`` sides around it lie in an image of ``shape`` (H, W); None when hardly at all."""
-    corners = warp(square(0.0, TEMPLATE_UNITS))
-    widest = max(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).max(), 1.0)
-    lines = int(np.clip(widest * (1 + 2 * reach) / SPACING_PX, FEWEST_LINES, MOST_LINES))
+    lines = int(np.clip(_widest_px(warp) * (1 + 2 * reach) / SPACING_PX, FEWEST_LINES, MOST_LINES))
     points, stencil = _grid(lines, reach)
     at, right, below = warp(stencil.reshape(-1, 2)).reshape(3, -1, 2)
     J = 2 * np.stack([right - at, below - at], axis=2)
@@ -246,16 +252,20 @@ class Alignment(Generic[W]):
 
         As if all were independent: as many of them as the warp has parameters tell no more than these.
         """
-        return float(np.sqrt(self._variance_px2(template) + SIGMA_FLOOR_PX**2))
+        return float(np.sqrt(self._variance_px2(template) + self._floor_px() ** 2))
 
     @property
     def cautious_covariance(self) -> Array:
         """Return the covariance (P, P) enlarged so that the outer corners are known no better than ``sigma_px``."""
-        return (1 + SIGMA_FLOOR_PX**2 / self._variance_px2(square(0.0, TEMPLATE_UNITS))) * self.covariance
+        return (1 + self._floor_px() ** 2 / self._variance_px2(_OUTER)) * self.covariance
 
     def _variance_px2(self, template: Array) -> float:
         J = self.warp.jacobian(template)
         return float(np.einsum("nip,pq,niq->", J, self.covariance, J)) / len(self.covariance)
+
+    def _floor_px(self) -> float:
+        """Return ``SIGMA_FLOOR_PX``, more where a print looks so large that its grid is coarse."""
+        return SIGMA_FLOOR_PX * max(1.0, _widest_px(self.warp) / FINELY_SAMPLED_PX)
 
 
 class Synthesis:
