@@ -31,7 +31,7 @@ from astratag.curved import (
     seen_whole,
 )
 from astratag.cylinder import CylinderWarp
-from astratag.describe import ALIGNED_POLISHED_PX, LEAST_POLISHED, PIXEL_BLUR, SQUARES, WARPS, Describer, inside, lead
+from astratag.describe import LEAST_POLISHED, PIXEL_BLUR, SQUARES, WARPS, Describer, inside, lead
 from astratag.detection import Detection, LayerDetection
 from astratag.fit import follows_all_sides
 from astratag.geometry import LAYERS, Layer, layer_points, square
@@ -168,7 +168,7 @@ class Confirmer(Describer):
                     return detection
         method = "tps" if candidate.bent else "planar"
         detection = self._described(view, candidate.reading, warp, (corners,), method)
-        return self.polished(view, detection, ALIGNED_POLISHED_PX)
+        return self.polished(view, detection, np.inf)  # what was not measured by edges
 
     def _more_like(self, view: View, marker_id: int, warp: Warp, other: Warp) -> bool:
         """Return whether the whole print looks clearly more like the marker through one warp than through another."""

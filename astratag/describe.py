@@ -46,10 +46,10 @@ WARPS = 2 * len(LAYERS)
 """How often a candidate is read whose edges are measured: in each layer, in even light and relit."""
 PIXEL_BLUR = 0.9
 """Blur from which squares are matched, pixels: a good lens's, and what sampling between pixels adds."""
-POLISHED_PX, ALIGNED_POLISHED_PX, LEAST_POLISHED = 75.0, 90.0, 0.95
+POLISHED_PX, FOLLOWED_BY_PIXELS_PX, LEAST_POLISHED = 75.0, 90.0, 0.95
 """Markers that look smaller than this are measured by all their pixels, not by their edges, where these look right.
 
-The second is for those whose edges could not be measured at all.
+The second is for those that are followed and whose edges could not be measured at all.
 """
 SQUARES = np.array([square(*layer.black) for layer in LAYERS])
 """The black squares' corners (3, 4, 2), template units."""
