@@ -56,7 +56,8 @@ MOST_LINES, FEWEST_LINES = 32, 12
 """Grid lines across the print: so many that they are ``SPACING_PX`` apart where it looks widest, within bounds."""
 SIGMA_FLOOR_PX = 0.02
 """What a point's standard deviation never falls below: print, lens model, shape of the blur."""
-FINELY_SAMPLED_PX = 64.0
+FINELY_SAMPLED_PX, COARSENESS = 64.0, 1.5
+"""Prints that look larger are sampled so coarsely that this grows, by this power of their size."""
 LEAST_BLUR_PX, MOST_BLUR_PX = 0.5, 8.0
 BLUR_STEP = 0.3
 """How far one step may take the logarithm of the blur, as a standard deviation."""
@@ -265,7 +266,7 @@ class Alignment(Generic[W]):
 
     def _floor_px(self) -> float:
         """Return ``SIGMA_FLOOR_PX``, more where a print looks so large that its grid is coarse."""
-        return SIGMA_FLOOR_PX * max(1.0, _widest_px(self.warp) / FINELY_SAMPLED_PX)
+        return SIGMA_FLOOR_PX * max(1.0, _widest_px(self.warp) / FINELY_SAMPLED_PX) ** COARSENESS
 
 
 class Synthesis:
