@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -44,8 +45,10 @@ GRID = np.stack(np.meshgrid(*[np.linspace(0.0, TEMPLATE_UNITS, GRID_LINES)] * 2)
 """The print's regular grid (9, 9, 2), template units, rows from the top."""
 WARPS = 2 * len(LAYERS)
 """How often a candidate is read whose edges are measured: in each layer, in even light and relit."""
-PIXEL_BLUR = 0.9
+PIXEL_BLUR = 0.95
 """Blur from which squares are matched, pixels: a good lens's, and what sampling between pixels adds."""
+POLISHED_TO_PX = 0.08
+"""The step after one that moved a print by less would move it by a hundredth of a pixel."""
 POLISHED_PX, FOLLOWED_BY_PIXELS_PX, LEAST_POLISHED = 75.0, 90.0, 0.95
 """Markers that look smaller than this are measured by all their pixels, not by their edges, where these look right.
 
@@ -208,7 +211,8 @@ class Describer:
             ]
             poses = [detection.T_cam_marker, *mirrored]
             starts = [PoseWarp(view.camera, spec.side_m, spec.surface, T_cam_marker) for T_cam_marker in poses]
-        aligned = [self._synthesis.align(view.light, start, detection.marker_id, PIXEL_BLUR) for start in starts]
+        align = partial(self._synthesis.align, settled_px=POLISHED_TO_PX)
+        aligned = [align(view.light, start, detection.marker_id, PIXEL_BLUR) for start in starts]
         best = max((one for one in aligned if one is not None), key=lambda one: one.correlation, default=None)
         if best is None or best.correlation < LEAST_POLISHED:
             return detection

@@ -314,10 +314,19 @@ class Synthesis:
             scores[layer.index] = _contrast(seen, np.column_stack([seen.plane, looks.beyond]), value, looks.mean)[1]
         return scores
 
-    def align(self, light: Light, warp: W, marker_id: int, blur_px: float, steps: int = STEPS) -> Alignment[W] | None:
+    def align(
+        self,
+        light: Light,
+        warp: W,
+        marker_id: int,
+        blur_px: float,
+        steps: int = STEPS,
+        settled_px: float = SETTLED_PX,
+    ) -> Alignment[W] | None:
         """Return ``warp`` and the blur moved until the image looks most like a marker; None when it is lost.
 
-        Light and contrast may each vary in a plane over the print.
+        Light and contrast may each vary in a plane over the print.  A step that moves it by less than ``settled_px`` is
+        the last.
         """
         size = len(warp.step_sigma())
         alignment = None
@@ -342,7 +351,7 @@ class Synthesis:
             blur_px = float(np.clip(blur_px * np.exp(x[size]), LEAST_BLUR_PX, MOST_BLUR_PX))
             moved_px = float(np.abs(J @ x[:size]).max())
             alignment = Alignment(warp, blur_px, correlation, covariance[:size, :size], moved_px)
-            if moved_px < SETTLED_PX:
+            if moved_px < settled_px:
                 break
         return alignment
 
