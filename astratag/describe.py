@@ -49,11 +49,8 @@ PIXEL_BLUR = 0.95
 """Blur from which squares are matched, pixels: a good lens's, and what sampling between pixels adds."""
 POLISHED_TO_PX = 0.08
 """The step after one that moved a print by less would move it by a hundredth of a pixel."""
-POLISHED_PX, FOLLOWED_BY_PIXELS_PX, LEAST_POLISHED = 75.0, 90.0, 0.95
-"""Markers that look smaller than this are measured by all their pixels, not by their edges, where these look right.
-
-The second is for those that are followed and whose edges could not be measured at all.
-"""
+POLISHED_PX, LEAST_POLISHED = 90.0, 0.95
+"""Markers that look smaller than this are measured by all their pixels, not by their edges, where these look right."""
 SQUARES = np.array([square(*layer.black) for layer in LAYERS])
 """The black squares' corners (3, 4, 2), template units."""
 SQUARES.flags.writeable = False

@@ -12,7 +12,7 @@ from astratag.camera import Camera
 from astratag.candidates import OUTER
 from astratag.checks import instance
 from astratag.confirm import COST_LIMIT
-from astratag.describe import FOLLOWED_BY_PIXELS_PX
+from astratag.describe import POLISHED_PX
 from astratag.detection import Detection
 from astratag.detector import EVERY_WAY, HALVE_FROM_PX, Detector, surest
 from astratag.edges import EDGE_LAYER
@@ -146,7 +146,7 @@ class Tracker:
         """Return a tracked marker that is too small or blurred for its edges to be followed."""
         for T_cam_marker in track.predictions:
             warp = self._predicted(view, track.marker_id, T_cam_marker)
-            if layer_side_px(warp, 0) < FOLLOWED_BY_PIXELS_PX:
+            if layer_side_px(warp, 0) < POLISHED_PX:
                 detection = self.detector.match_near(view, track.marker_id, warp, "tracked")
                 if detection is not None:
                     return detection
