@@ -49,6 +49,8 @@ Array = NDArray[np.float64]
 
 COST_LIMIT = 1.0
 """Mean truncated squared residual (of 9 at most) above which a fit that was begun near its end is not believed."""
+CYLINDER_COST_LIMIT = 0.4
+"""The same of a cylinder of unknown radius: a wrong radius leaves more, where noise of 20 grey levels leaves 0.2."""
 CERTAIN_LIKENESS = 0.75
 """Likeness from which no other layer is tried."""
 LEAST_LOOKS = (0.72, 0.72, 0.85)
@@ -242,7 +244,7 @@ class Confirmer(Describer):
         """Return the fit of a whole print on a cylinder, begun at measured layers; None when poor or hardly bent."""
         like = PrintLike(view.some_camera, self.spec(marker_id).side_m, self.near(marker_id))
         fit = on_cylinder(view.light, view.gray, layers, marker_id, self._artwork, like)
-        return fit if fit is not None and fit.cost < COST_LIMIT and clearly_bent(fit) else None
+        return fit if fit is not None and fit.cost < CYLINDER_COST_LIMIT and clearly_bent(fit) else None
 
     def _layers_agree(self, view: View, detection: Detection, warp: FittedWarp, looks: Array) -> bool:
         """Return whether a measured layer looks like itself and not like another, which may have the same edges.
