@@ -2,8 +2,8 @@
 
 Of all smooth maps through given correspondences the thin-plate spline bends least (Bookstein, 1989).  The
 correspondences are the corners of the nested squares and the middles of the outer one's sides: the AstraTag
-paper's fallback for curved surfaces.  Where the knots
-lie is searched by ``candidates``: sides bulge as the contour does, and what is between them shifts along.
+paper's fallback for curved surfaces, and ours where no cylinder explains what is seen.  Where the knots lie is
+searched by ``candidates``: sides bulge as the contour does, and what is between them shifts along.
 """
 
 from __future__ import annotations
