@@ -14,6 +14,6 @@ COPY schemas schemas
 COPY pipeline pipeline
 COPY nodes nodes
 COPY recordings recordings
-RUN uv sync --frozen --no-dev
+RUN uv sync --frozen --no-dev && .venv/bin/python -c "import astratag"
 
 CMD ["relnav", "--help"]

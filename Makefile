@@ -27,6 +27,7 @@ $(STAMP): pyproject.toml uv.lock
 	fi; \
 	echo "setup: $(VENV) from uv.lock"; \
 	"$$uv" sync --quiet --frozen --python $(PYTHON) $(addprefix --extra ,$(EXTRAS))
+	@echo "setup: compiling the detector" && $(RUN)/python -c "import astratag"
 	@rm -f $(VENV)/.synced* && touch $@
 
 replay: $(STAMP) ## Replay the shipped approach corridor, live in Rerun, and score it
