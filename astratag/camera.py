@@ -16,6 +16,7 @@ import yaml
 from numpy.typing import ArrayLike, NDArray
 
 from astratag.checks import file_path, numbers, whole
+from astratag.compiled import MATRIX, REAL, VECTOR, compiled
 
 Array = NDArray[np.float64]
 DISTORTION_TERMS = 5
@@ -23,7 +24,8 @@ LEAST_FOCAL = 0.02
 """Focal length, as a fraction of the image, below which K is in another unit: a pinhole would see 175 degrees."""
 LARGEST_PX = 1e9
 """What is more in K is damaged."""
-_IMAGE_AXES = np.eye(2)[:, :, None]
+NEAREST = 1e-9
+"""Points nearer than this, or behind the camera, have the derivative of one there."""
 SKEW_ALLOWED = 1e-6
 """Skew, as a fraction of the focal length, that is rounding left by a calibration program."""
 PRINCIPAL_POINT_SLACK = 0.15
@@ -38,10 +40,8 @@ class Camera:
     distortion: Array = field(default_factory=lambda: np.zeros(DISTORTION_TERMS))
     width: int = 0
     height: int = 0
-    _pinhole: tuple[float, float, float, float] = field(init=False, repr=False)
-    """K's numbers: fx, fy, cx, cy."""
-    _terms: tuple[float, ...] | None = field(init=False, repr=False)
-    """The distortion's numbers, None when there is none."""
+    lens: Array = field(init=False, repr=False)
+    """All of its numbers (9,), for compiled functions: fx, fy, cx, cy, k1, k2, p1, p2, k3."""
 
     def __init__(self, K: ArrayLike, distortion: ArrayLike = (0.0,) * DISTORTION_TERMS, *, width: int, height: int):
         K, distortion = numbers(K, "K"), numbers(distortion, "distortion").ravel()
@@ -65,10 +65,9 @@ class Camera:
             )
         padded = np.zeros(DISTORTION_TERMS)
         padded[: distortion.size] = distortion
-        focal_and_centre = (K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item())
-        terms = tuple(padded.tolist()) if padded.any() else None
-        fields = {"K": K, "distortion": padded, "width": width, "height": height}
-        for name, value in (*fields.items(), ("_pinhole", focal_and_centre), ("_terms", terms)):
+        lens = np.concatenate([K[[0, 1, 0, 1], [0, 1, 2, 2]], padded])
+        fields = {"K": K, "distortion": padded, "width": width, "height": height, "lens": lens}
+        for name, value in fields.items():
             object.__setattr__(self, name, value)
 
     @classmethod
@@ -134,41 +133,11 @@ class Camera:
 
     def project(self, points_cam: Array) -> Array:
         """Return pixels (N, 2) of points (N, 3) in the camera frame, which must lie in front of it (z > 0)."""
-        X, Y, Z = np.asarray(points_cam, dtype=float).reshape(-1, 3).T
-        x, y = X / Z, Y / Z
-        if self._terms is not None:
-            k1, k2, p1, p2, k3 = self._terms
-            xx, yy, xy2 = x * x, y * y, 2 * x * y
-            rr = xx + yy
-            radial = 1 + rr * (k1 + rr * (k2 + rr * k3))
-            x, y = x * radial + p1 * xy2 + p2 * (rr + 2 * xx), y * radial + p1 * (rr + 2 * yy) + p2 * xy2
-        fx, fy, cx, cy = self._pinhole
-        at = np.empty((2, len(x)))
-        at[0], at[1] = fx * x + cx, fy * y + cy
-        return at.T
+        return _project(np.ascontiguousarray(points_cam, dtype=float).reshape(-1, 3), self.lens)
 
     def projection_jacobian(self, points_cam: Array) -> Array:
         """Return d pixel / d point (N, 2, 3), px per metre, at points (N, 3) in the camera frame (z > 0)."""
-        points = np.asarray(points_cam, dtype=float).reshape(-1, 3).T
-        return np.stack([self.projection_slopes(points, axis) for axis in _IMAGE_AXES]).transpose(2, 0, 1)
-
-    def projection_slopes(self, points_cam: Array, along: Array) -> Array:
-        """Return d pixel / d point along image vectors (2, N): (3, N), px per metre, at points (3, N) with z > 0."""
-        X, Y, Z = points_cam
-        inverse_z = 1 / np.maximum(Z, 1e-9)
-        x, y = X * inverse_z, Y * inverse_z
-        fx, fy, _, _ = self._pinhole
-        a, b = along[0] * (fx * inverse_z), along[1] * (fy * inverse_z)
-        if self._terms is not None:  # Brown, "Close-range camera calibration", 1971, differentiated
-            k1, k2, p1, p2, k3 = self._terms
-            rr = x * x + y * y
-            radial = 1 + rr * (k1 + rr * (k2 + rr * k3))
-            slope = 2 * (k1 + rr * (2 * k2 + rr * (3 * k3)))  # d radial / d r, over r
-            mixed = x * y * slope + 2 * (p1 * x + p2 * y)
-            by_x = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
-            by_y = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
-            a, b = a * by_x + b * mixed, a * mixed + b * by_y
-        return np.stack([a, b, -(a * x + b * y)])
+        return _projection_jacobian(np.ascontiguousarray(points_cam, dtype=float).reshape(-1, 3), self.lens)
 
     def undistort(self, points_px: Array) -> Array:
         """Return where pixels (N, 2) would be without distortion, in normalised coordinates x/z, y/z (N, 2)."""
@@ -177,6 +146,59 @@ class Camera:
             return (points.reshape(-1, 2) - self.K[:2, 2]) @ np.linalg.inv(self.K[:2, :2]).T
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-12)
         return cv2.undistortPoints(points, self.K, self.distortion, criteria=criteria).reshape(-1, 2)
+
+
+@compiled(REAL, REAL, REAL, VECTOR)
+def pixel(x: float, y: float, z: float, lens: Array) -> tuple[float, float]:
+    """Return where a point of the camera frame is seen, pixels."""
+    x, y = x / z, y / z
+    k1, k2, p1, p2, k3 = lens[4], lens[5], lens[6], lens[7], lens[8]
+    xx, yy, xy2 = x * x, y * y, 2 * x * y
+    rr = xx + yy
+    radial = 1 + rr * (k1 + rr * (k2 + rr * k3))
+    u = x * radial + p1 * xy2 + p2 * (rr + 2 * xx)
+    v = y * radial + p1 * (rr + 2 * yy) + p2 * xy2
+    return lens[0] * u + lens[2], lens[1] * v + lens[3]
+
+
+@compiled(REAL, REAL, REAL, VECTOR, REAL, REAL)
+def pixel_slope(x: float, y: float, z: float, lens: Array, a: float, b: float) -> tuple[float, float, float]:
+    """Return how a point's pixel moves along the image vector (a, b) when the point does, px per metre.
+
+    Brown, "Close-range camera calibration", 1971, differentiated.
+    """
+    inverse_z = 1 / max(z, NEAREST)
+    x, y = x * inverse_z, y * inverse_z
+    k1, k2, p1, p2, k3 = lens[4], lens[5], lens[6], lens[7], lens[8]
+    a, b = a * lens[0] * inverse_z, b * lens[1] * inverse_z
+    rr = x * x + y * y
+    radial = 1 + rr * (k1 + rr * (k2 + rr * k3))
+    slope = 2 * (k1 + rr * (2 * k2 + rr * (3 * k3)))  # d radial / d r, over r
+    mixed = x * y * slope + 2 * (p1 * x + p2 * y)
+    by_x = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
+    by_y = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
+    a, b = a * by_x + b * mixed, a * mixed + b * by_y
+    return a, b, -(a * x + b * y)
+
+
+@compiled(MATRIX, VECTOR)
+def _project(points_cam: Array, lens: Array) -> Array:
+    """Return the pixels (N, 2) of points (N, 3)."""
+    at = np.empty((len(points_cam), 2))
+    for i in range(len(points_cam)):
+        at[i] = pixel(points_cam[i, 0], points_cam[i, 1], points_cam[i, 2], lens)
+    return at
+
+
+@compiled(MATRIX, VECTOR)
+def _projection_jacobian(points_cam: Array, lens: Array) -> Array:
+    """Return how the pixels of points (N, 3) move with them (N, 2, 3)."""
+    J = np.empty((len(points_cam), 2, 3))
+    for i in range(len(points_cam)):
+        x, y, z = points_cam[i]
+        J[i, 0] = pixel_slope(x, y, z, lens, 1.0, 0.0)
+        J[i, 1] = pixel_slope(x, y, z, lens, 0.0, 1.0)
+    return J
 
 
 def _size_from_principal_point(K: Array, width: int | None, height: int | None) -> tuple[int, int]:

@@ -13,11 +13,12 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.camera import Camera
+from astratag.camera import Camera, pixel_slope
+from astratag.compiled import MATRIX, REAL, VECTOR, compiled
 from astratag.geometry import TEMPLATE_UNITS, print_from_template, square
 from astratag.surface import Cylinder
 from astratag.transforms import pose
-from astratag.warp import GRAZING_COSINE, PoseWarp
+from astratag.warp import GRAZING_COSINE, PoseWarp, slopes_of
 
 Array = NDArray[np.float64]
 
@@ -63,24 +64,15 @@ class CylinderWarp:
 
     def jacobian(self, template: Array) -> Array:
         """Return the derivative (N, 2, 8): the pose's six, then curvature and axis."""
-        side_m, surface, T = self.pose.side_m, self.surface, self.pose.T_cam_marker
-        on_print = print_from_template(template, side_m)
-        along, across = np.array([(c := np.cos(surface.axis_rad)), (s := np.sin(surface.axis_rad))]), np.array([-s, c])
-        a, b = on_print @ along, on_print @ across
-        angle = b / surface.radius_m
-        sine, cosine = np.sin(angle), np.cos(angle)
-        radius_step = -(surface.radius_m**2) / side_m  # d radius / d curvature
-        bowed = np.column_stack([np.outer(sine - angle * cosine, across), cosine - 1 + angle * sine])
-        flat = np.outer(b - surface.radius_m * sine, along) + np.outer(a * (1 - cosine), across)
-        by_axis = np.column_stack([flat, a * sine])
-        points_cam = surface.points(on_print) @ T[:3, :3].T + T[:3, 3]
-        by_surface = np.stack([radius_step * bowed, by_axis], axis=2)
-        extra = self.pose.camera.projection_jacobian(points_cam) @ (T[:3, :3] @ by_surface)
+        surface, on_print = self.surface, print_from_template(np.ascontiguousarray(template), self.pose.side_m)
+        extra = _by_surface(
+            on_print, self.pose.T_cam_marker, self.pose.camera.lens, surface.radius_m, surface.axis_rad, self.pose.side_m
+        )
         return np.concatenate([self.pose.jacobian(template), extra], axis=2)
 
     def slopes(self, template: Array, along: Array) -> Array:
         """Return the derivative (8, N) along unit vectors (2, N)."""
-        return np.einsum("dn,ndp->pn", along, self.jacobian(template))
+        return slopes_of(self.jacobian(template), np.ascontiguousarray(along))
 
     def stepped(self, delta: Array) -> CylinderWarp:
         """Return pose, curvature and axis moved."""
@@ -108,6 +100,35 @@ class CylinderWarp:
         T = self.pose.T_cam_marker @ pose(np.array([(c, -s, 0), (s, c, 0), (0, 0, 1)], dtype=float), np.zeros(3))
         axis_rad = self.surface.axis_rad + quarter_turns * np.pi / 2
         return replace(self, pose=replace(self.pose, surface=replace(self.surface, axis_rad=axis_rad), T_cam_marker=T))
+
+
+@compiled(MATRIX, MATRIX, VECTOR, REAL, REAL, REAL)
+def _by_surface(
+    on_print: Array, T_cam_marker: Array, lens: Array, radius_m: float, axis_rad: float, side_m: float
+) -> Array:
+    """Return how the pixels of print points (N, 2) move with the cylinder's curvature and axis (N, 2, 2)."""
+    T, c, s = T_cam_marker, np.cos(axis_rad), np.sin(axis_rad)
+    radius_step = -(radius_m**2) / side_m  # d radius / d curvature
+    J = np.empty((len(on_print), 2, 2))
+    for i in range(len(on_print)):
+        x, y = on_print[i]
+        a, b = c * x + s * y, c * y - s * x  # along the axis, and across it
+        angle = b / radius_m
+        sine, cosine = np.sin(angle), np.cos(angle)
+        bowed = radius_step * (sine - angle * cosine)
+        by_curvature = (-s * bowed, c * bowed, radius_step * (cosine - 1 + angle * sine))
+        slid, turned = b - radius_m * sine, a * (1 - cosine)
+        by_axis = (c * slid - s * turned, s * slid + c * turned, a * sine)
+        across = radius_m * sine
+        point = (c * a - s * across, s * a + c * across, radius_m * (cosine - 1))
+        at = [T[k, 0] * point[0] + T[k, 1] * point[1] + T[k, 2] * point[2] + T[k, 3] for k in range(3)]
+        for axis in range(2):
+            gx, gy, gz = pixel_slope(at[0], at[1], at[2], lens, 1.0 - axis, 1.0 * axis)
+            for column, by in enumerate((by_curvature, by_axis)):
+                J[i, axis, column] = 0.0
+                for k in range(3):
+                    J[i, axis, column] += by[k] * (T[0, k] * gx + T[1, k] * gy + T[2, k] * gz)
+    return J
 
 
 def assumed_camera(width_px: int, height_px: int) -> Camera:

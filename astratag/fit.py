@@ -13,11 +13,15 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.edges import POINTS_PER_EDGE, SMOOTHING_PX, EdgePoints, locate, template_of
+from astratag.compiled import FLAG_MATRIX, INDICES, INT, MATRIX, REAL, VECTOR, compiled
+from astratag.edges import POINTS_PER_EDGE, template_of
+from astratag.linear import inverse_of
+from astratag.locate import SMOOTHING_PX, EdgePoints, locate
 from astratag.neighbours import Crossings, narrowing, pull
 from astratag.warp import FittedWarp
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 W = TypeVar("W", bound=FittedWarp)
 
 BIAS_SIGMA_PX = 0.04
@@ -32,7 +36,10 @@ PULL_PX, PULL_FLOOR_PX = 0.023, 0.002
 """How far a whole edge may be off when its neighbours are as near as ``SHARP_REACH_PX``, and at least."""
 NUISANCE_SIGMA = np.array([BIAS_SIGMA_PX, 0.15])
 """Prior standard deviations of the edge bias, and of how wrong what is known of all pulls is, as a fraction of them."""
-_PARAMETERS, _NUISANCE = slice(0, -len(NUISANCE_SIGMA)), slice(-len(NUISANCE_SIGMA), None)
+NUISANCES = len(NUISANCE_SIGMA)
+_PARAMETERS = slice(0, -NUISANCES)
+OUTERMOST = 4
+"""The first so many edges are those of the outermost square."""
 PULL_REST, PULL_GROWTH = 0.05, 2.0
 """How wrong a single pull is besides; how much faster than a weak pull a strong one grows with blur."""
 BACKGROUND = 0.5
@@ -95,79 +102,141 @@ def fit_edges(
     ``near`` is what lies beside the edges in the print of a known code: what it pulls them by is taken off.
     """
     seen = _located(light, warp, edges, search_px)
-    use = _usable(seen)
-    if not _on_all_sides(seen, use):
+    use = _usable(seen.found, seen.in_view, seen.lie.reach_px)
+    if not _on_all_sides(edges, use):
         return None
     known = _pulls(seen, near, use)
-    use = clear if _on_all_sides(seen, clear := use & ~known.lost) else use
+    use = clear if _on_all_sides(edges, clear := use & ~known.lost) else use
     moved = _gauss_newton(warp, seen, known, use)
     if moved is None:
         return None
-    fitted, left, nuisance, solution = moved
+    fitted, A, left, solution = moved
     offset = (seen.offset_px - known.pull_px)[use]
-    residual = left - solution.x[_NUISANCE] @ nuisance
-    by_point = np.zeros((3, *use.shape))
-    by_point[:, use] = (
-        solution.weight,
-        offset - left + residual,
-        ((solution.covariance[_NUISANCE, _NUISANCE] @ nuisance) * nuisance).sum(axis=0),
-    )
-    in_view = max(int(np.count_nonzero(seen.in_view[seen.reach_px >= SHARP_REACH_PX])), len(residual))
-    truncated = np.minimum((residual / COST_UNIT_PX) ** 2, COST_CAP).sum() + COST_CAP * (in_view - len(residual))
+    residual, cost = _cost(A, left, solution.x, seen.in_view, seen.lie.reach_px)
     return EdgeFit(
         warp=fitted,
         before=warp,
         points=seen,
-        weight=by_point[0],
-        offset_px=by_point[1],
-        shared_px2=by_point[2],
+        weight=_at_points(use, solution.weight),
+        offset_px=_at_points(use, offset - left + residual),
+        shared_px2=_at_points(use, _variance_of_nuisance(A, solution.covariance)),
         sigma_px=solution.sigma_px,
         covariance=solution.covariance[_PARAMETERS, _PARAMETERS],
-        cost=float(truncated / in_view),
+        cost=cost,
         moved_px=float(np.abs(offset - left).max()),
     )
+
+
+@compiled(MATRIX, VECTOR, VECTOR, FLAG_MATRIX, VECTOR)
+def _cost(A: Array, left: Array, x: Array, in_view: Mask, reach_px: Array) -> tuple[Array, float]:
+    """Return what is left (N,) once the nuisance's part is taken off, and the mean of its truncated squares.
+
+    Points (E, M) in view on sharp edges that were not used count as far off.
+    """
+    residual, truncated, sharp = np.empty(len(left)), 0.0, 0
+    for i in range(len(left)):
+        residual[i] = left[i]
+        for p in range(len(x) - NUISANCES, len(x)):
+            residual[i] -= x[p] * A[p, i]
+        truncated += min((residual[i] / COST_UNIT_PX) ** 2, COST_CAP)
+    for e in range(len(reach_px)):
+        if reach_px[e] >= SHARP_REACH_PX:
+            sharp += np.count_nonzero(in_view[e])
+    in_all = max(sharp, len(left))
+    return residual, (truncated + COST_CAP * (in_all - len(left))) / in_all
+
+
+@compiled(MATRIX, MATRIX)
+def _variance_of_nuisance(A: Array, covariance: Array) -> Array:
+    """Return the variance (N,) of what the nuisance does to each point."""
+    first, size = len(A) - NUISANCES, len(A)
+    variance = np.zeros(A.shape[1])
+    for i in range(A.shape[1]):
+        for p in range(first, size):
+            for q in range(first, size):
+                variance[i] += A[p, i] * covariance[p, q] * A[q, i]
+    return variance
+
+
+@compiled(FLAG_MATRIX, VECTOR)
+def _at_points(use: Mask, values: Array) -> Array:
+    """Return values (N,) of the points to use at their places (E, M), 0 elsewhere."""
+    at, i = np.zeros(use.shape), 0
+    for e in range(use.shape[0]):
+        for m in range(use.shape[1]):
+            if use[e, m]:
+                at[e, m] = values[i]
+                i += 1
+    return at
 
 
 def _located(light: NDArray[np.float32], warp: W, edges: NDArray[np.int64], search_px: float) -> EdgePoints:
     """Return where edges are, the blurred ones through a wider filter, as far as neighbours leave room for it."""
     seen = locate(light, warp, edges, search_px)
-    wider_px = min(SMOOTHING_OF_LENS * seen.lens_px, float(seen.reach_px.max()) / REACH_OF_SMOOTHING)
+    wider_px = min(SMOOTHING_OF_LENS * seen.lens_px, float(seen.lie.reach_px.max()) / REACH_OF_SMOOTHING)
     if wider_px < WORTHWHILE * SMOOTHING_PX:
         return seen
     return locate(light, warp, edges, search_px, round(wider_px / SMOOTHING_STEP_PX) * SMOOTHING_STEP_PX)
 
 
-def _gauss_newton(
-    warp: W, seen: EdgePoints, known: _Pulls, use: NDArray[np.bool_]
-) -> tuple[W, Array, Array, _Solution] | None:
+def _gauss_newton(warp: W, seen: EdgePoints, known: _Pulls, use: Mask) -> tuple[W, Array, Array, _Solution] | None:
     """Return the warp that brings the N points to ``use`` to where they were measured; None when it goes astray.
 
-    Also what is left of their offsets (N,), what they feel (2, N) of bias and wrong pulls, and the last solution.  One
-    step does where the warp is as good as linear; a small square seen nearly square-on needs more, for its tilt shows
-    in the second order.
+    Also what they feel (P, N) of the parameters and the nuisance, what is left of their offsets (N,), and the last
+    solution.  One step does where the warp is as good as linear; a small square seen nearly square-on needs more, for
+    its tilt shows in the second order.
     """
-    template, used = template_of(seen.edge).points, use.ravel()
-    normal = seen.normal.reshape(2, -1)
-    offset_px = seen.offset_px - known.pull_px
-    places_px = seen.predicted_px.reshape(2, -1) + offset_px.ravel() * normal
-    share = np.minimum(1.0, seen.length_px / (POINTS_PER_EDGE * CORRELATION_LENGTH_PX)).repeat(POINTS_PER_EDGE)
-    left, keen, share, variance = offset_px[use], known.keen[use], share[used], known.variance[use]
+    template, used = template_of(seen.edge).points, np.flatnonzero(use)
+    normal = seen.lie.normal.reshape(2, -1)
+    offset_px = (seen.offset_px - known.pull_px).ravel()
+    places_px = seen.lie.predicted_px.reshape(2, -1) + offset_px * normal
+    share = np.minimum(1.0, seen.lie.length_px / (POINTS_PER_EDGE * CORRELATION_LENGTH_PX)).repeat(POINTS_PER_EDGE)
+    parts = (offset_px, known.keen.ravel(), share, known.variance.ravel(), known.growth.ravel())
+    left, keen, share, variance, growth = (part[used] for part in parts)
     prior_sigma = np.concatenate([warp.step_sigma(), NUISANCE_SIGMA])
-    A = np.ones((len(prior_sigma), len(left)))
-    A[-1] = known.growth[use]
     for _ in range(MAX_STEPS):
-        A[_PARAMETERS] = warp.slopes(template, normal)[:, used]
-        solution = _robust_least_squares(A, left, keen, share, variance, prior_sigma)
+        A = _felt(warp.slopes(template, normal), used, growth)
+        solution = _Solution(*_robust_least_squares(A, left, keen, share, variance, prior_sigma))
         step = solution.x[_PARAMETERS]
         if not np.isfinite(step).all():
             return None
-        expected = left - step @ A[_PARAMETERS]
         warp = warp.stepped(step)
-        off = (places_px - warp(template).T) * normal
-        left = (off[0] + off[1])[used]
-        if np.abs(left - expected).max() < LINEAR_PX:
+        left, surprise_px = _left(places_px, warp(template), normal, used, left, A, step)
+        if surprise_px < LINEAR_PX:
             break
-    return warp, left, A[_NUISANCE], solution
+    return warp, A, left, solution
+
+
+@compiled(MATRIX, INDICES, VECTOR)
+def _felt(slopes: Array, used: NDArray[np.int64], growth: Array) -> Array:
+    """Return what N of all points feel of the parameters (P, all), and of the nuisance: bias and wrong pulls."""
+    size = len(slopes)
+    A = np.empty((size + NUISANCES, len(used)))
+    for i in range(len(used)):
+        for p in range(size):
+            A[p, i] = slopes[p, used[i]]
+        A[size, i], A[size + 1, i] = 1.0, growth[i]
+    return A
+
+
+@compiled(MATRIX, MATRIX, MATRIX, INDICES, VECTOR, MATRIX, VECTOR)
+def _left(
+    places_px: Array, at_px: Array, normal: Array, used: NDArray[np.int64], before: Array, A: Array, step: Array
+) -> tuple[Array, float]:
+    """Return how far N points now are (all, 2) from their places (2, all), and most by how much that is a surprise.
+
+    It was ``before`` (N,), and should have changed by ``step`` (P,).
+    """
+    left, surprise_px = np.empty(len(used)), 0.0
+    for i in range(len(used)):
+        k = used[i]
+        dx, dy = places_px[0, k] - at_px[k, 0], places_px[1, k] - at_px[k, 1]
+        left[i] = dx * normal[0, k] + dy * normal[1, k]
+        expected = before[i]
+        for p in range(len(step)):
+            expected -= step[p] * A[p, i]
+        surprise_px = max(surprise_px, abs(left[i] - expected))
+    return left, surprise_px
 
 
 class _Solution(NamedTuple):
@@ -179,17 +248,25 @@ class _Solution(NamedTuple):
     covariance: Array
 
 
-def _usable(seen: EdgePoints) -> NDArray[np.bool_]:
+@compiled(FLAG_MATRIX, FLAG_MATRIX, VECTOR)
+def _usable(found: Mask, in_view: Mask, reach_px: Array) -> Mask:
     """Return which points (E, M) to use: those of edges mostly found and not too near their neighbours."""
-    found, in_view = (np.count_nonzero(part, axis=1) for part in (seen.found, seen.in_view))
-    mostly = found >= LEAST_FOUND * np.maximum(in_view, LEAST_IN_VIEW * POINTS_PER_EDGE)
-    return seen.found & (mostly & (seen.reach_px >= LEAST_REACH_PX))[:, None]
+    use = np.zeros(found.shape, np.bool_)
+    for e in range(len(found)):
+        least = LEAST_FOUND * max(np.count_nonzero(in_view[e]), LEAST_IN_VIEW * POINTS_PER_EDGE)
+        if np.count_nonzero(found[e]) >= least and reach_px[e] >= LEAST_REACH_PX:
+            use[e] = found[e]
+    return use
 
 
-def _on_all_sides(seen: EdgePoints, use: NDArray[np.bool_]) -> bool:
+@compiled(INDICES, FLAG_MATRIX)
+def _on_all_sides(edges: NDArray[np.int64], use: Mask) -> bool:
     """Return whether the points to use (E, M) lie on all four sides: edges come in fours, sides of a square."""
-    enough = np.count_nonzero(use, axis=1) >= LEAST_ON_SIDE
-    return len(set((seen.edge[enough] % 4).tolist())) == 4
+    followed = np.zeros(4, np.bool_)
+    for e in range(len(edges)):
+        if np.count_nonzero(use[e]) >= LEAST_ON_SIDE:
+            followed[edges[e] % 4] = True
+    return followed.all()
 
 
 def follows_all_sides(fit: EdgeFit[W]) -> bool:
@@ -211,96 +288,127 @@ class _Pulls(NamedTuple):
     variance: Array
     keen: Array
     growth: Array
-    lost: NDArray[np.bool_]
+    lost: Mask
 
 
-def _pulls(seen: EdgePoints, near: Crossings | None, use: NDArray[np.bool_]) -> _Pulls:
+def _pulls(seen: EdgePoints, near: Crossings | None, use: Mask) -> _Pulls:
     """Return what is known of the pulls on points to ``use`` (E, M), nothing without ``near``."""
-    pull_px, growth, variance = np.zeros((3, *use.shape))
-    keen = np.ones(use.shape)
+    lie = seen.lie
     if near is None:
-        off_px = PULL_PX * (SHARP_REACH_PX / np.maximum(seen.reach_px, 1e-3)) ** 2 + PULL_FLOOR_PX
-        variance[:] = POINTS_PER_EDGE * (np.square(off_px)[:, None] + np.square(seen.clipped_px))
-        return _Pulls(pull_px, variance, keen, growth, pull_px > 0)
+        off_px = PULL_PX * (SHARP_REACH_PX / np.maximum(lie.reach_px, 1e-3)) ** 2 + PULL_FLOOR_PX
+        variance = POINTS_PER_EDGE * (np.square(off_px)[:, None] + np.square(seen.clipped_px))
+        return _Pulls(np.zeros(use.shape), variance, np.ones(use.shape), np.zeros(use.shape), np.zeros(use.shape, bool))
     blur_px = _blur_alone(seen, near)
-    pulled = np.flatnonzero(use.any(axis=1) & (seen.reach_px < FAR_REACH * blur_px))
-    pull_px[pulled], keen[pulled] = pull(near, seen.edge[pulled], seen.unit_px[pulled], blur_px)
-    size_px = np.abs(pull_px)
-    lost = ~(size_px <= MOST_PULL * blur_px)
-    pull_px[lost] = 0.0
-    np.multiply(pull_px, 1 + PULL_GROWTH / blur_px * size_px, out=growth)
-    np.add(np.square(PULL_REST * pull_px), PULL_FLOOR_PX**2, out=variance)
-    outermost = seen.edge < 4
-    margin = seen.margin_px[outermost] / blur_px
-    if margin.min(initial=np.inf) < FAR_MARGIN:
-        margin = np.clip(margin, 1.0, FAR_MARGIN)
-        variance[outermost] += np.square(BACKGROUND * blur_px * margin * np.exp(-0.5 * margin * margin))
-    variance[lost] = LOST_PX**2
-    variance += np.square(seen.clipped_px)  # glare moves all points of an edge alike
-    variance *= POINTS_PER_EDGE
-    return _Pulls(pull_px, variance, keen, growth, lost)
+    pulled = np.flatnonzero(use.any(axis=1) & (lie.reach_px < FAR_REACH * blur_px))
+    pull_px, keen = np.zeros(use.shape), np.ones(use.shape)
+    if len(pulled):
+        pull_px[pulled], keen[pulled] = pull(near, seen.edge[pulled], lie.unit_px[pulled], blur_px)
+    return _Pulls(*_known(pull_px, keen, blur_px, seen.edge, lie.margin_px, seen.clipped_px))
+
+
+@compiled(MATRIX, MATRIX, REAL, INDICES, MATRIX, MATRIX)
+def _known(
+    pull_px: Array, keen: Array, blur_px: float, edges: NDArray[np.int64], margin_px: Array, clipped_px: Array
+) -> tuple[Array, Array, Array, Array, Mask]:
+    """Return what pulls (E, M), NaN where there is no knowing, tell: the fields of ``_Pulls``."""
+    believed, variance, growth = np.zeros(pull_px.shape), np.empty(pull_px.shape), np.zeros(pull_px.shape)
+    lost = np.zeros(pull_px.shape, np.bool_)
+    for e in range(pull_px.shape[0]):
+        for m in range(pull_px.shape[1]):
+            size_px = abs(pull_px[e, m])
+            if size_px <= MOST_PULL * blur_px:
+                believed[e, m] = pull_px[e, m]
+                growth[e, m] = pull_px[e, m] * (1 + PULL_GROWTH / blur_px * size_px)
+                wrong_px2 = (PULL_REST * size_px) ** 2 + PULL_FLOOR_PX**2
+                margin = margin_px[e, m] / blur_px
+                if edges[e] < OUTERMOST and margin < FAR_MARGIN:
+                    margin = max(margin, 1.0)
+                    wrong_px2 += (BACKGROUND * blur_px * margin * np.exp(-0.5 * margin * margin)) ** 2
+            else:
+                lost[e, m], wrong_px2 = True, LOST_PX**2
+            variance[e, m] = POINTS_PER_EDGE * (wrong_px2 + clipped_px[e, m] ** 2)  # glare moves a whole edge alike
+    return believed, variance, keen.copy(), growth, lost
 
 
 def _blur_alone(seen: EdgePoints, near: Crossings) -> float:
     """Return the blur that edges would show without neighbours, which narrow or widen them."""
     edges = np.flatnonzero(seen.alone.any(axis=1))
-    if len(edges) == 0 or seen.reach_px[edges].min() > FAR_REACH * seen.blur_px:
+    if len(edges) == 0 or seen.lie.reach_px[edges].min() > FAR_REACH * seen.blur_px:
         return seen.blur_px
     blur_px, use = seen.blur_px, seen.alone[edges]
     for _ in range(MOST_BLUR_STEPS):
-        narrowed = narrowing(near, seen.edge[edges], seen.unit_px[edges], blur_px)[use]
+        narrowed = narrowing(near, seen.edge[edges], seen.lie.unit_px[edges], blur_px)[use]
         before_px, blur_px = blur_px, seen.blur_px * float(np.sqrt(narrowed.sum() / len(narrowed)))
         if abs(blur_px - before_px) < SAME_BLUR * before_px:
             break
     return blur_px
 
 
-def _robust_least_squares(
-    A: Array, offset: Array, keen: Array, share: Array, common: Array, prior_sigma: Array
-) -> _Solution:
-    """Solve x A = offset (N,) with Tukey's weights, each unknown known to be 0 within ``prior_sigma`` (P,) beforehand.
-
-    ``A`` (P, N) has a row for each unknown.
-    """
-    A, offset, common = A * keen, offset * keen, common * (keen * keen)  # now all points are as noisy
-    scale = np.sqrt(np.einsum("pn,pn->p", A, A)) + 1e-12  # metres and radians differ by orders: solve in pixels
-    A /= scale[:, None]
-    prior = np.diag((prior_sigma * scale) ** -2.0 + 1e-9)
-    middle = len(offset) // 2
-    pulled, quiet = common / POINTS_PER_EDGE, common <= np.partition(common, middle)[middle]
-    sigma_px = FIRST_SIGMA_PX
-    weight = 1 / (sigma_px**2 / share + common)
-    for reweighted in range(REWEIGHTINGS):
-        weighted = A * weight
-        covariance = np.linalg.inv(weighted @ A.T + prior)
-        x = covariance @ (weighted @ offset)
-        residual = offset - x @ A
-        before_px, sigma_px = sigma_px, max(_spread(residual[quiet]), NOISE_FLOOR_PX)
-        u2 = np.minimum(residual * residual / (TUKEY**2 * (sigma_px**2 + pulled)), 1.0)
-        if reweighted and abs(sigma_px - before_px) <= SAME_SPREAD * before_px:
-            break
-        weight = np.square(1 - u2) / (sigma_px**2 / share + common)
-    inflated = _of_tukey(u2, len(x))
-    weight *= keen * keen / inflated
-    return _Solution(x / scale, weight, sigma_px, inflated / np.outer(scale, scale) * covariance)
-
-
+@compiled(VECTOR, INT)
 def _of_tukey(u2: Array, unknowns: int) -> float:
     """Return how much larger the variance is than the weights of N points promise.
 
     ``u2`` (N,) are squared residuals over TUKEY sigma, 1 at most.  Huber, "Robust statistics", 1981, eq. 7.6.2: near 1
     for many Gaussian residuals, more for heavy tails.
     """
-    points = len(u2)
-    less = 1 - u2
-    robust = less * less
-    curving = float(less @ (1 - 5 * u2)) / points
-    felt = TUKEY**2 * float((u2 * robust) @ robust) / points
-    promised = felt * float(robust.sum()) / max(curving, LEAST_CURVING) ** 2 / max(points - unknowns, 1)
+    points, curving, felt, weights = len(u2), 0.0, 0.0, 0.0
+    for i in range(points):
+        less = 1 - u2[i]
+        curving += less * (1 - 5 * u2[i]) / points
+        felt += TUKEY**2 * u2[i] * less**4 / points
+        weights += less**2
+    promised = felt * weights / max(curving, LEAST_CURVING) ** 2 / max(points - unknowns, 1)
     return max(promised, 1.0)
 
 
+@compiled(VECTOR)
 def _spread(residual: Array) -> float:
     """Return the robust standard deviation: 1.4826 times the median absolute residual."""
     middle = len(residual) // 2
-    return float(1.4826 * np.partition(np.abs(residual), middle)[middle])
+    return 1.4826 * np.partition(np.abs(residual), middle)[middle]
+
+
+@compiled(MATRIX, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR)
+def _robust_least_squares(
+    A: Array, offset: Array, keen: Array, share: Array, common: Array, prior_sigma: Array
+) -> tuple[Array, Array, float, Array]:
+    """Solve x A = offset (N,) with Tukey's weights, each unknown known to be 0 within ``prior_sigma`` (P,) beforehand.
+
+    ``A`` (P, N) has a row for each unknown.  Returns the fields of ``_Solution``.
+    """
+    size, points = A.shape
+    A, offset, common = A * keen, offset * keen, common * (keen * keen)  # now all points are as noisy
+    scale, prior = np.empty(size), np.empty(size)
+    for p in range(size):  # metres and radians differ by orders: solve in pixels
+        scale[p] = np.sqrt((A[p] * A[p]).sum()) + 1e-12
+        A[p] /= scale[p]
+        prior[p] = 1 / (prior_sigma[p] * scale[p]) ** 2 + 1e-9
+    middle = points // 2
+    quiet = common <= np.partition(common, middle)[middle]
+    sigma_px = FIRST_SIGMA_PX
+    weight, u2, residual, x = 1 / (sigma_px**2 / share + common), np.empty(points), np.empty(points), np.empty(size)
+    covariance = np.empty((size, size))
+    for reweighted in range(REWEIGHTINGS):
+        right = np.zeros(size)
+        for p in range(size):
+            weighted = A[p] * weight
+            right[p] = (weighted * offset).sum()
+            for q in range(p + 1):
+                covariance[p, q] = covariance[q, p] = (weighted * A[q]).sum()
+            covariance[p, p] += prior[p]
+        covariance = inverse_of(covariance)
+        residual[:] = offset
+        for p in range(size):
+            x[p] = (covariance[p] * right).sum()
+            residual -= x[p] * A[p]
+        before_px, sigma_px = sigma_px, max(_spread(residual[quiet]), NOISE_FLOOR_PX)
+        for i in range(points):
+            u2[i] = min(residual[i] ** 2 / (TUKEY**2 * (sigma_px**2 + common[i] / POINTS_PER_EDGE)), 1.0)
+        if reweighted and abs(sigma_px - before_px) <= SAME_SPREAD * before_px:
+            break
+        weight = (1 - u2) ** 2 / (sigma_px**2 / share + common)
+    inflated = _of_tukey(u2, size)
+    for p in range(size):
+        for q in range(size):
+            covariance[p, q] *= inflated / (scale[p] * scale[q])
+    return x / scale, weight * (keen * keen / inflated), sigma_px, covariance

@@ -33,7 +33,7 @@ def measure_layers(fit: EdgeFit[FittedWarp], shape: tuple[int, int]) -> tuple[La
     weight, offset, shared = by_edge[:, _BLACK_EDGES]
     measured = (np.count_nonzero(weight, axis=2) >= LEAST_FOUND * POINTS_PER_EDGE).all(axis=1)
     reach_px = np.zeros(len(EDGES))
-    reach_px[edge] = fit.points.reach_px
+    reach_px[edge] = fit.points.lie.reach_px
     sharp = measured & (reach_px[_BLACK_EDGES].min(axis=1) >= SHARP_REACH_PX)
     measured = sharp if sharp.any() else measured
     corners, variance = _layer_corners(fit.before(_CORNER_PROBES), offset, weight)

@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from astratag.compiled import CUBE, INDICES, INT, MATRIX, REAL, compiled
 from astratag.edges import EDGE_POINTS, EDGE_REACH, EDGES, INK_TO_PAPER
 from astratag.geometry import CELLS, DRAWN_OFFSET, LAYERS, cell_polygons, layer_points
 
 Array = NDArray[np.float64]
-Single = NDArray[np.float32]
 
 PAPER, INK = CELLS, CELLS + 1
 """Labels of what is no cell."""
@@ -29,6 +29,8 @@ BESIDE_UNITS = 0.02
 FAR = 1e6
 LITTLE = 0.1
 """A first step of Newton's method shorter than this, in blurs, needs no second."""
+BELL_ENDS = 5.0
+"""Bells further away, in blurs, do not matter."""
 LEAST_CURVATURE = 0.35
 """How round the top must be, relative to that of an edge alone, to be the edge's own."""
 
@@ -40,9 +42,9 @@ class Crossings(NamedTuple):
     units of the edge's own times the cosine of the angle it is crossed at; ``cosine`` (K, E, M) that cosine.
     """
 
-    distance: Single
-    jump: Single
-    cosine: Single
+    distance: Array
+    jump: Array
+    cosine: Array
 
 
 @lru_cache(maxsize=128)
@@ -54,7 +56,7 @@ def crossings(code: bytes) -> Crossings:
     nearest = np.argsort(np.where(jump != 0, np.abs(distance), np.inf), axis=2, kind="stable")[..., :MOST_CROSSINGS]
     kept = (np.take_along_axis(part, nearest, axis=2) for part in (distance, jump, cosine))
     d, j, c = (np.ascontiguousarray(part.transpose(2, 0, 1)) for part in kept)
-    return Crossings(*(part.astype(np.float32) for part in (np.where(j != 0, d, FAR), j, c)))
+    return Crossings(np.where(j != 0, d, FAR), j, c)
 
 
 @cache
@@ -123,13 +125,24 @@ class Pull(NamedTuple):
     curvature: Array
 
 
-def _sum_of_bells(z: Single, jump: Single, cosine: Single) -> tuple[Single, Single, Single]:
-    """Return slope, curvature downwards and height (E, M) of an edge's own bell at its top and K others ``z`` away."""
-    bell = jump * np.exp(-0.5 * z * z)
-    bent = cosine * bell
-    slope = np.add.reduce(z * bent, axis=0)
-    bent *= cosine
-    return slope, 1 - np.add.reduce((z * z - 1) * bent, axis=0), 1 + np.add.reduce(bell, axis=0)
+@compiled(CUBE, CUBE, CUBE, INT, INT, REAL, REAL)
+def _sum_of_bells(
+    distance: Array, jump: Array, cosine: Array, edge: int, point: int, unit: float, x: float
+) -> tuple[float, float, float]:
+    """Return slope, curvature downwards and height, at ``x``, of a point's own bell, of height 1 at 0, and all others.
+
+    Of the own bell as it is at its top; ``unit`` is how large a template unit looks, and everything is in blurs.
+    """
+    slope, curvature, height = 0.0, 1.0, 1.0
+    for k in range(MOST_CROSSINGS):
+        c = cosine[k, edge, point]
+        z = c * (distance[k, edge, point] * unit - x)
+        if abs(z) < BELL_ENDS and jump[k, edge, point] != 0.0:
+            bell = jump[k, edge, point] * np.exp(-0.5 * z * z)
+            slope += z * c * bell
+            curvature -= (z * z - 1) * c * c * bell
+            height += bell
+    return slope, curvature, height
 
 
 def pull(near: Crossings, edges: NDArray[np.int64], unit_px: Array, blur_px: float) -> Pull:
@@ -137,28 +150,44 @@ def pull(near: Crossings, edges: NDArray[np.int64], unit_px: Array, blur_px: flo
 
     ``unit_px`` (E, M) is how large a template unit looks across the edge.  Newton's method on the sum of bells.
     """
-    z, jump, cosine = _distances(near, edges, unit_px, blur_px)
-    slope, curvature, height = _sum_of_bells(z, jump, cosine)
-    x = (slope / np.maximum(curvature, LEAST_CURVATURE)).astype(np.float32, copy=False)
-    if np.abs(x).max(initial=0.0) > LITTLE:
-        slope, curvature, height = _sum_of_bells(z - cosine * x, jump, cosine)
-        own = np.exp(-0.5 * x * x)
-        curvature += (1 - x * x) * own - 1
-        height += own - 1
-        x += (slope - x * own) / np.maximum(curvature, LEAST_CURVATURE)
-    x[(curvature < LEAST_CURVATURE) | (height < LEAST_CURVATURE)] = np.nan
-    return Pull((x * blur_px).astype(float), np.maximum(curvature, LEAST_CURVATURE).astype(float))
+    return Pull(*_pull(*near, edges, unit_px, blur_px))
+
+
+@compiled(CUBE, CUBE, CUBE, INDICES, MATRIX, REAL)
+def _pull(
+    distance: Array, jump: Array, cosine: Array, edges: NDArray[np.int64], unit_px: Array, blur_px: float
+) -> tuple[Array, Array]:
+    pull_px, roundness = np.empty(unit_px.shape), np.empty(unit_px.shape)
+    for e in range(len(edges)):
+        for m in range(unit_px.shape[1]):
+            unit = unit_px[e, m] / blur_px
+            slope, curvature, height = _sum_of_bells(distance, jump, cosine, edges[e], m, unit, 0.0)
+            x = slope / max(curvature, LEAST_CURVATURE)
+            if abs(x) > LITTLE:
+                slope, curvature, height = _sum_of_bells(distance, jump, cosine, edges[e], m, unit, x)
+                own = np.exp(-0.5 * x * x)
+                curvature += (1 - x * x) * own - 1
+                height += own - 1
+                x += (slope - x * own) / max(curvature, LEAST_CURVATURE)
+            believed = curvature >= LEAST_CURVATURE and height >= LEAST_CURVATURE
+            pull_px[e, m] = x * blur_px if believed else np.nan
+            roundness[e, m] = max(curvature, LEAST_CURVATURE)
+    return pull_px, roundness
 
 
 def narrowing(near: Crossings, edges: NDArray[np.int64], unit_px: Array, blur_px: float) -> Array:
     """Return how much rounder (E, M) the tops of slopes are for their height than those of edges without neighbours."""
-    _, curvature, height = _sum_of_bells(*_distances(near, edges, unit_px, blur_px))
-    return np.maximum(curvature, LEAST_CURVATURE) / np.maximum(height, LEAST_CURVATURE)
+    return _narrowing(*near, edges, unit_px, blur_px)
 
 
-def _distances(
-    near: Crossings, edges: NDArray[np.int64], unit_px: Array, blur_px: float
-) -> tuple[Single, Single, Single]:
-    """Return how far the crossings are, square to them and in blurs, their jumps and their cosines, all (K, E, M)."""
-    cosine = near.cosine[:, edges]
-    return near.distance[:, edges] * (cosine * (unit_px / blur_px).astype(np.float32)), near.jump[:, edges], cosine
+@compiled(CUBE, CUBE, CUBE, INDICES, MATRIX, REAL)
+def _narrowing(
+    distance: Array, jump: Array, cosine: Array, edges: NDArray[np.int64], unit_px: Array, blur_px: float
+) -> Array:
+    rounder = np.empty(unit_px.shape)
+    for e in range(len(edges)):
+        for m in range(unit_px.shape[1]):
+            unit = unit_px[e, m] / blur_px
+            _, curvature, height = _sum_of_bells(distance, jump, cosine, edges[e], m, unit, 0.0)
+            rounder[e, m] = max(curvature, LEAST_CURVATURE) / max(height, LEAST_CURVATURE)
+    return rounder

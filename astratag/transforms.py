@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from astratag.compiled import MATRIX, VECTOR, compiled
+
 Array = NDArray[np.float64]
 
 
@@ -57,9 +59,7 @@ def skew(v: ArrayLike) -> Array:
 
 def perturb(T_a_b: Array, xi: ArrayLike) -> Array:
     """Return T_a_b moved by xi = (rho m, theta rad) (6,) in the axes of b."""
-    xi = np.asarray(xi, dtype=float)
-    R = T_a_b[:3, :3]
-    return pose(R @ exp_so3(xi[3:]), T_a_b[:3, 3] + R @ xi[:3])
+    return _perturbed(np.ascontiguousarray(T_a_b, dtype=float), np.ascontiguousarray(xi, dtype=float))
 
 
 def difference(T_a_b: Array, T_a_b_hat: Array) -> Array:
@@ -90,3 +90,30 @@ def wxyz_from_rotation(R_a_b: Array) -> Array:
 def rotation_from_wxyz(rotation_wxyz: ArrayLike) -> Array:
     """Return the rotation (3, 3) of a quaternion (w, x, y, z)."""
     return Rotation.from_quat(np.asarray(rotation_wxyz, dtype=float), scalar_first=True).as_matrix()
+
+
+SMALL_ANGLE_RAD = 1e-4
+"""Below it the series are exact to the last digit."""
+
+
+@compiled(MATRIX, VECTOR)
+def _perturbed(T_a_b: Array, xi: Array) -> Array:
+    """Return ``perturb``: Rodrigues' formula, and a product of transforms."""
+    x, y, z = xi[3], xi[4], xi[5]
+    angle2 = x * x + y * y + z * z
+    angle = math.sqrt(angle2)
+    if angle < SMALL_ANGLE_RAD:
+        sine, versine = 1 - angle2 / 6, 0.5 - angle2 / 24  # over the angle, and over its square
+    else:
+        sine, versine = math.sin(angle) / angle, (1 - math.cos(angle)) / angle2
+    moved = np.zeros((4, 4))
+    moved[3, 3] = 1.0
+    for i in range(3):
+        a, b, c = T_a_b[i, 0], T_a_b[i, 1], T_a_b[i, 2]
+        along = versine * (a * x + b * y + c * z)
+        same = 1 - versine * angle2
+        moved[i, 0] = same * a + along * x + sine * (b * z - c * y)
+        moved[i, 1] = same * b + along * y + sine * (c * x - a * z)
+        moved[i, 2] = same * c + along * z + sine * (a * y - b * x)
+        moved[i, 3] = T_a_b[i, 3] + a * xi[0] + b * xi[1] + c * xi[2]
+    return moved

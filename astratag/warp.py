@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.camera import Camera
+from astratag.camera import Camera, pixel, pixel_slope
+from astratag.compiled import CUBE, MATRIX, REAL, VECTOR, compiled
 from astratag.geometry import TEMPLATE_UNITS, print_from_template
 from astratag.surface import Flat, Surface
 from astratag.transforms import perturb
@@ -25,7 +26,10 @@ Array = NDArray[np.float64]
 OUTSIDE_PX = -1e4
 """Where points behind the camera are said to be: far outside every image."""
 BEND_STEP_PX = 3.0
-_AXES = np.eye(2)[:, :, None]
+LEAST_DEPTH = 1e-6
+"""Homogeneous depth below which a point of a plane is at infinity or behind the camera."""
+NEAREST_SIDES = 1e-3
+"""Points of a print nearer than so many of its sides are behind the camera."""
 GRAZING_COSINE = 0.12
 """Print seen flatter than this (83 degrees from its normal) is not used."""
 
@@ -63,6 +67,11 @@ def _normalised(template: Array) -> Array:
     return np.asarray(template) / (TEMPLATE_UNITS / 2) - 1.0
 
 
+def _listed(template: Array) -> Array:
+    """Return template points (..., 2) as a list (N, 2) in C order."""
+    return np.ascontiguousarray(template, dtype=float).reshape(-1, 2)
+
+
 @dataclass(frozen=True, eq=False)
 class HomographyWarp:
     """A plane seen by a camera without distortion; ``H`` (3, 3) with H[2, 2] = 1 takes -1..1 to pixels."""
@@ -81,34 +90,15 @@ class HomographyWarp:
 
     def __call__(self, template: Array) -> Array:
         """Return pixels (..., 2)."""
-        u = _normalised(template)
-        w = u @ self.H[:, :2].T + self.H[:, 2]
-        depth = w[..., 2:]
-        return np.where(depth > 1e-6, w[..., :2] / np.where(depth > 1e-6, depth, 1.0), OUTSIDE_PX)
+        return _through_plane(_listed(template), self.H).reshape(np.shape(template))
 
     def jacobian(self, template: Array) -> Array:
         """Return the derivative (N, 2, 8) by the first eight entries of H."""
-        u = _normalised(template)
-        w = u @ self.H[:, :2].T + self.H[:, 2]
-        depth = np.maximum(w[:, 2], 1e-6)
-        homogeneous = np.concatenate([u, np.ones((len(u), 1))], axis=1) / depth[:, None]
-        p = w[:, :2] / depth[:, None]
-        J = np.zeros((len(u), 2, 8))
-        J[:, 0, 0:3] = homogeneous
-        J[:, 1, 3:6] = homogeneous
-        J[:, :, 6:8] = -p[:, :, None] * homogeneous[:, None, :2]
-        return J
+        return _plane_jacobian(_listed(template), self.H)
 
     def slopes(self, template: Array, along: Array) -> Array:
         """Return the derivative (8, N) along unit vectors (2, N) by the first eight entries of H."""
-        u = _normalised(template).T
-        w = self.H[:, :2] @ u + self.H[:, 2:]
-        inverse_depth = 1 / np.maximum(w[2], 1e-6)
-        a, b = along * inverse_depth
-        by_depth = -(a * w[0] + b * w[1]) * inverse_depth
-        S = np.empty((8, u.shape[1]))
-        S[0:2], S[2], S[3:5], S[5], S[6:8] = a * u, a, b * u, b, by_depth * u
-        return S
+        return slopes_of(_plane_jacobian(_listed(template), self.H), np.ascontiguousarray(along))
 
     def stepped(self, delta: Array) -> HomographyWarp:
         """Return H + delta."""
@@ -221,35 +211,20 @@ class PoseWarp:
         """Return points and outward normals (3, N) in the marker frame."""
         return on_surface(self.surface, self.side_m, template)
 
-    def _cam(self, points_marker: Array) -> Array:
-        """Return points (3, N) of the marker frame in the camera's."""
-        return self.T_cam_marker[:3, :3] @ points_marker + self.T_cam_marker[:3, 3:]
-
     def __call__(self, template: Array) -> Array:
         """Return pixels (..., 2)."""
-        points_cam = self._cam(self._marker(template)[0])
-        behind = points_cam[2] <= 1e-3 * self.side_m
-        if not behind.any():
-            return self.camera.project(points_cam.T).reshape(np.shape(template))
-        points_cam[:, behind] = ((0.0,), (0.0,), (1.0,))
-        at = self.camera.project(points_cam.T)
-        at[behind] = OUTSIDE_PX
+        points_marker, nearest_m = self._marker(template)[0], NEAREST_SIDES * self.side_m
+        at = _seen(points_marker, self.T_cam_marker, self.camera.lens, nearest_m)
         return at.reshape(np.shape(template))
 
     def jacobian(self, template: Array) -> Array:
         """Return the derivative (N, 2, 6) by a right perturbation of the pose, metres then radians."""
-        return np.stack([self.slopes(template, axis) for axis in _AXES]).transpose(2, 0, 1)
+        return _pose_jacobian(self._marker(template)[0], self.T_cam_marker, self.camera.lens)
 
     def slopes(self, template: Array, along: Array) -> Array:
         """Return the derivative (6, N) along unit vectors (2, N)."""
-        points_marker = self._marker(template)[0]
-        by_point = self.camera.projection_slopes(self._cam(points_marker), along)
-        S = np.empty((6, points_marker.shape[1]))
-        np.matmul(self.T_cam_marker[:3, :3].T, by_point, out=S[:3])
-        x, y, z = points_marker
-        gx, gy, gz = S[:3]
-        S[3], S[4], S[5] = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx  # g . (theta x X)
-        return S
+        along = np.ascontiguousarray(along)
+        return _pose_slopes(self._marker(template)[0], self.T_cam_marker, self.camera.lens, along)
 
     def stepped(self, delta: Array) -> PoseWarp:
         """Return the pose perturbed."""
@@ -261,10 +236,7 @@ class PoseWarp:
             t = self.T_cam_marker[:3, 3]
             facing = -float(t @ self.T_cam_marker[:3, 2])  # distance from the plane
             return np.full(len(template), facing > GRAZING_COSINE * math.sqrt(t @ t))
-        points_marker, normals_marker = self._marker(template)
-        points_cam = self._cam(points_marker)
-        towards = -(points_cam * (self.T_cam_marker[:3, :3] @ normals_marker)).sum(axis=0)
-        return (towards > GRAZING_COSINE * np.sqrt((points_cam * points_cam).sum(axis=0))) & (points_cam[2] > 0)
+        return _facing(*self._marker(template), self.T_cam_marker)
 
     def step_sigma(self) -> Array:
         """Return no limits (6,)."""
@@ -274,3 +246,111 @@ class PoseWarp:
     def curved(self) -> bool:
         """Return whether the surface is anything but a plane."""
         return not isinstance(self.surface, Flat)
+
+
+@compiled(MATRIX, MATRIX)
+def _through_plane(template: Array, H: Array) -> Array:
+    """Return the pixels (N, 2) of template points (N, 2) under a homography of the print spanning -1..1."""
+    at = np.empty(template.shape)
+    for i in range(len(template)):
+        u, v = template[i, 0] / (TEMPLATE_UNITS / 2) - 1.0, template[i, 1] / (TEMPLATE_UNITS / 2) - 1.0
+        depth = H[2, 0] * u + H[2, 1] * v + H[2, 2]
+        if depth > LEAST_DEPTH:
+            at[i, 0] = (H[0, 0] * u + H[0, 1] * v + H[0, 2]) / depth
+            at[i, 1] = (H[1, 0] * u + H[1, 1] * v + H[1, 2]) / depth
+        else:
+            at[i] = OUTSIDE_PX
+    return at
+
+
+@compiled(MATRIX, MATRIX)
+def _plane_jacobian(template: Array, H: Array) -> Array:
+    """Return the derivative (N, 2, 8) of ``_through_plane`` by the first eight entries of H."""
+    J = np.zeros((len(template), 2, 8))
+    for i in range(len(template)):
+        u, v = template[i, 0] / (TEMPLATE_UNITS / 2) - 1.0, template[i, 1] / (TEMPLATE_UNITS / 2) - 1.0
+        depth = max(H[2, 0] * u + H[2, 1] * v + H[2, 2], LEAST_DEPTH)
+        for axis in range(2):
+            at = (H[axis, 0] * u + H[axis, 1] * v + H[axis, 2]) / depth
+            J[i, axis, 3 * axis] = u / depth
+            J[i, axis, 3 * axis + 1] = v / depth
+            J[i, axis, 3 * axis + 2] = 1 / depth
+            J[i, axis, 6] = -at * u / depth
+            J[i, axis, 7] = -at * v / depth
+    return J
+
+
+@compiled(CUBE, MATRIX)
+def slopes_of(J: Array, along: Array) -> Array:
+    """Return derivatives (N, 2, P) along unit vectors (2, N): (P, N)."""
+    slopes = np.empty((J.shape[2], J.shape[0]))
+    for p in range(J.shape[2]):
+        for i in range(J.shape[0]):
+            slopes[p, i] = along[0, i] * J[i, 0, p] + along[1, i] * J[i, 1, p]
+    return slopes
+
+
+@compiled(MATRIX, MATRIX)
+def _in_camera(points_marker: Array, T: Array) -> Array:
+    """Return points (3, N) of the marker frame in the camera's."""
+    points_cam = np.empty(points_marker.shape)
+    for axis in range(3):
+        for i in range(points_marker.shape[1]):
+            x, y, z = points_marker[0, i], points_marker[1, i], points_marker[2, i]
+            points_cam[axis, i] = T[axis, 0] * x + T[axis, 1] * y + T[axis, 2] * z + T[axis, 3]
+    return points_cam
+
+
+@compiled(MATRIX, MATRIX, VECTOR, REAL)
+def _seen(points_marker: Array, T_cam_marker: Array, lens: Array, nearest_m: float) -> Array:
+    """Return the pixels (N, 2) of points (3, N), those not before the camera outside every image."""
+    x, y, z = _in_camera(points_marker, T_cam_marker)
+    at = np.empty((len(x), 2))
+    for i in range(len(x)):
+        if z[i] > nearest_m:
+            at[i, 0], at[i, 1] = pixel(x[i], y[i], z[i], lens)
+        else:
+            at[i] = OUTSIDE_PX
+    return at
+
+
+@compiled(MATRIX, MATRIX, VECTOR, MATRIX)
+def _pose_slopes(points_marker: Array, T_cam_marker: Array, lens: Array, along: Array) -> Array:
+    """Return how the pixels of points (3, N) move along image vectors (2, N) as the pose is perturbed: (6, N)."""
+    R, points_cam = T_cam_marker, _in_camera(points_marker, T_cam_marker)
+    slopes = np.empty((6, points_marker.shape[1]))
+    for i in range(points_marker.shape[1]):
+        a, b, c = pixel_slope(points_cam[0, i], points_cam[1, i], points_cam[2, i], lens, along[0, i], along[1, i])
+        x, y, z = points_marker[0, i], points_marker[1, i], points_marker[2, i]
+        gx = R[0, 0] * a + R[1, 0] * b + R[2, 0] * c
+        gy = R[0, 1] * a + R[1, 1] * b + R[2, 1] * c
+        gz = R[0, 2] * a + R[1, 2] * b + R[2, 2] * c
+        slopes[0, i], slopes[1, i], slopes[2, i] = gx, gy, gz
+        slopes[3, i], slopes[4, i], slopes[5, i] = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx  # g . (theta x X)
+    return slopes
+
+
+@compiled(MATRIX, MATRIX, VECTOR)
+def _pose_jacobian(points_marker: Array, T_cam_marker: Array, lens: Array) -> Array:
+    """Return the derivative (N, 2, 6) of the pixels of points (3, N) by a right perturbation of the pose."""
+    J = np.empty((points_marker.shape[1], 2, 6))
+    for axis in range(2):
+        along = np.zeros((2, points_marker.shape[1]))
+        along[axis] = 1.0
+        J[:, axis] = _pose_slopes(points_marker, T_cam_marker, lens, along).T
+    return J
+
+
+@compiled(MATRIX, MATRIX, MATRIX)
+def _facing(points_marker: Array, normals_marker: Array, T_cam_marker: Array) -> NDArray[np.bool_]:
+    """Return which points (3, N) with outward normals (3, N) face the camera by more than a grazing angle."""
+    R, (x, y, z) = T_cam_marker, _in_camera(points_marker, T_cam_marker)
+    facing = np.empty(len(x), np.bool_)
+    for i in range(len(x)):
+        p, q, r = normals_marker[0, i], normals_marker[1, i], normals_marker[2, i]
+        towards = 0.0
+        for axis, across in enumerate((x[i], y[i], z[i])):
+            towards -= across * (R[axis, 0] * p + R[axis, 1] * q + R[axis, 2] * r)
+        length = np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
+        facing[i] = towards > GRAZING_COSINE * length and z[i] > 0
+    return facing
