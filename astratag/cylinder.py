@@ -66,7 +66,12 @@ class CylinderWarp:
         """Return the derivative (N, 2, 8): the pose's six, then curvature and axis."""
         surface, on_print = self.surface, print_from_template(np.ascontiguousarray(template), self.pose.side_m)
         extra = _by_surface(
-            on_print, self.pose.T_cam_marker, self.pose.camera.lens, surface.radius_m, surface.axis_rad, self.pose.side_m
+            on_print,
+            self.pose.T_cam_marker,
+            self.pose.camera.lens,
+            surface.radius_m,
+            surface.axis_rad,
+            self.pose.side_m,
         )
         return np.concatenate([self.pose.jacobian(template), extra], axis=2)
 

@@ -269,10 +269,16 @@ def _on_all_sides(edges: NDArray[np.int64], use: Mask) -> bool:
     return followed.all()
 
 
+@compiled(VECTOR)
+def followed(weight: Array) -> bool:
+    """Return whether a fit follows an edge, by the weights of its points (M,)."""
+    return np.count_nonzero(weight) >= LEAST_FOUND * POINTS_PER_EDGE
+
+
 def follows_all_sides(fit: EdgeFit[W]) -> bool:
     """Return whether a fit follows an edge on each of the four sides, of one square or of several."""
-    used = np.count_nonzero(fit.weight, axis=1) >= LEAST_FOUND * POINTS_PER_EDGE
-    return len(set((fit.points.edge[used] % 4).tolist())) == 4
+    sides = {int(edge) % 4 for edge, weight in zip(fit.points.edge, fit.weight, strict=True) if followed(weight)}
+    return len(sides) == 4
 
 
 class _Pulls(NamedTuple):
@@ -387,26 +393,32 @@ def _robust_least_squares(
     quiet = common <= np.partition(common, middle)[middle]
     sigma_px = FIRST_SIGMA_PX
     weight, u2, residual, x = 1 / (sigma_px**2 / share + common), np.empty(points), np.empty(points), np.empty(size)
-    covariance = np.empty((size, size))
+    covariance, weighted = np.empty((size, size)), np.empty(points)
     for reweighted in range(REWEIGHTINGS):
         right = np.zeros(size)
         for p in range(size):
-            weighted = A[p] * weight
-            right[p] = (weighted * offset).sum()
+            for i in range(points):
+                weighted[i] = A[p, i] * weight[i]
+                right[p] += weighted[i] * offset[i]
             for q in range(p + 1):
-                covariance[p, q] = covariance[q, p] = (weighted * A[q]).sum()
+                total = 0.0
+                for i in range(points):
+                    total += weighted[i] * A[q, i]
+                covariance[p, q] = covariance[q, p] = total
             covariance[p, p] += prior[p]
         covariance = inverse_of(covariance)
         residual[:] = offset
         for p in range(size):
             x[p] = (covariance[p] * right).sum()
-            residual -= x[p] * A[p]
+            for i in range(points):
+                residual[i] -= x[p] * A[p, i]
         before_px, sigma_px = sigma_px, max(_spread(residual[quiet]), NOISE_FLOOR_PX)
         for i in range(points):
             u2[i] = min(residual[i] ** 2 / (TUKEY**2 * (sigma_px**2 + common[i] / POINTS_PER_EDGE)), 1.0)
         if reweighted and abs(sigma_px - before_px) <= SAME_SPREAD * before_px:
             break
-        weight = (1 - u2) ** 2 / (sigma_px**2 / share + common)
+        for i in range(points):
+            weight[i] = (1 - u2[i]) ** 2 / (sigma_px**2 / share[i] + common[i])
     inflated = _of_tukey(u2, size)
     for p in range(size):
         for q in range(size):

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from astratag.compiled import INDICES, INT, MATRIX, REAL, VECTOR, array, compiled
 from astratag.detection import LayerDetection
 from astratag.edges import ALONG, EDGES, POINTS_PER_EDGE
-from astratag.fit import LEAST_FOUND, SHARP_REACH_PX, EdgeFit
+from astratag.fit import SHARP_REACH_PX, EdgeFit, followed
 from astratag.geometry import LAYERS, square
 from astratag.warp import FittedWarp
 
@@ -16,6 +17,8 @@ Array = NDArray[np.float64]
 LEAST_DETERMINANT = 1e-9
 """Of the equations of a line, so that edges that were not seen do no harm."""
 LEAST_SINE = 1e-6
+_BLACK_EDGES = np.array([[i for i, e in enumerate(EDGES) if e.layer == k and not e.frame] for k in range(len(LAYERS))])
+"""The edges (3, 4) of each layer's black square, clockwise from the top."""
 CORNER_FLOOR_PX = 0.004
 """What a corner's standard deviation never falls below: print and lens model."""
 
@@ -27,25 +30,17 @@ def measure_layers(fit: EdgeFit[FittedWarp], shape: tuple[int, int]) -> tuple[La
     corners would be wrong together.  Each edge is its predicted curve moved by an offset and a tilt of its own; corners
     are where neighbours meet.
     """
-    by_edge = np.zeros((3, len(EDGES), POINTS_PER_EDGE))
-    edge = fit.points.edge
-    by_edge[0, edge], by_edge[1, edge], by_edge[2, edge] = fit.weight, fit.offset_px, fit.shared_px2
-    weight, offset, shared = by_edge[:, _BLACK_EDGES]
-    measured = (np.count_nonzero(weight, axis=2) >= LEAST_FOUND * POINTS_PER_EDGE).all(axis=1)
-    reach_px = np.zeros(len(EDGES))
-    reach_px[edge] = fit.points.lie.reach_px
-    sharp = measured & (reach_px[_BLACK_EDGES].min(axis=1) >= SHARP_REACH_PX)
-    measured = sharp if sharp.any() else measured
-    corners, variance = _layer_corners(fit.before(_CORNER_PROBES), offset, weight)
-    height, width = shape
-    found = []
-    for layer in np.flatnonzero(measured).tolist():
-        square_px = corners[layer]
-        if square_px.min() >= 0 and square_px[:, 0].max() <= width - 1 and square_px[:, 1].max() <= height - 1:
-            common = shared[layer].sum() / np.count_nonzero(weight[layer])
-            sigma_px = float(np.sqrt(variance[layer] + common + CORNER_FLOOR_PX**2))
-            found.append(LayerDetection(layer, square_px, sigma_px))
-    return tuple(found)
+    corners, sigma_px = _measured(
+        fit.before(_CORNER_PROBES),
+        fit.points.edge,
+        fit.offset_px,
+        fit.weight,
+        fit.shared_px2,
+        fit.points.lie.reach_px,
+        *shape,
+    )
+    seen = np.flatnonzero(sigma_px < np.inf).tolist()
+    return tuple(LayerDetection(layer, corners[layer], float(sigma_px[layer])) for layer in seen)
 
 
 def _corner_probes() -> Array:
@@ -59,46 +54,82 @@ _CORNER_PROBES = _corner_probes()
 _CORNER_PROBES.flags.writeable = False  # so that warps may keep where they are on a surface
 
 
-def _layer_corners(around_px: Array, offset: Array, weight: Array) -> tuple[Array, Array]:
-    """Return the corners (L, 4, 2) of squares and their variances (L,) from the offsets (L, 4, M) of edges.
-
-    ``around_px`` (3, L, 4, 2) is where the corners are predicted, and the outlines a little before and after each.
-    """
-    predicted, before, after = around_px
-    ends, variances = _edge_lines(offset, weight)
-    # two lines meet at a corner: the end of one edge and the start of the next
-    nx, ny = _outward(predicted - before)
-    mx, my = _outward(after - predicted)
-    a, b = ends[..., 1][:, _PREVIOUS], ends[..., 0]
-    moved = np.stack([a * my - b * ny, b * nx - a * mx], axis=-1)
-    sine = nx * my - ny * mx
-    sine = np.where(np.abs(sine) > LEAST_SINE, sine, LEAST_SINE)  # edges behind the camera meet far away
-    a, b = variances[..., 1][:, _PREVIOUS], variances[..., 0]
-    variance = ((a * (my**2 + mx**2) + b * (ny**2 + nx**2)) / (2 * sine**2)).mean(axis=1)
-    return predicted + moved / sine[..., None], variance
-
-
-def _outward(tangent: Array) -> tuple[Array, Array]:
-    """Return x and y of the unit normals to the left of clockwise tangents (..., 2), out of the square."""
-    dx, dy = tangent[..., 0], tangent[..., 1]
-    length = np.maximum(np.sqrt(dx * dx + dy * dy), 1e-9)
+@compiled(REAL, REAL)
+def _outward(dx: float, dy: float) -> tuple[float, float]:
+    """Return the unit normal to the left of a clockwise tangent, out of the square."""
+    length = max(np.sqrt(dx * dx + dy * dy), 1e-9)
     return dy / length, -dx / length
 
 
-def _edge_lines(offset: Array, weight: Array) -> tuple[Array, Array]:
-    """Return the offsets (..., 2) of lines fitted along edges (..., M) at their two ends, and their variances."""
-    moments = weight @ _LINE_MOMENTS
-    ss, se, ee = moments[..., 0], moments[..., 1], moments[..., 2]
-    seen = (weight * offset) @ _LINE
-    s, e = seen[..., 0], seen[..., 1]
-    determinant = np.maximum(ss * ee - se * se, LEAST_DETERMINANT)
-    variances = np.stack([ee, ss], axis=-1) / determinant[..., None]
-    return np.stack([ee * s - se * e, ss * e - se * s], axis=-1) / determinant[..., None], variances
+@compiled(VECTOR, VECTOR)
+def _edge_line(offset: Array, weight: Array) -> tuple[float, float, float, float]:
+    """Return the offsets of a line fitted along an edge (M,) at its start and its end, and their variances."""
+    ss = se = ee = s = e = 0.0
+    for m in range(POINTS_PER_EDGE):
+        start, end = (1 - ALONG[m]) * weight[m], ALONG[m] * weight[m]
+        ss, se, ee = ss + start * (1 - ALONG[m]), se + start * ALONG[m], ee + end * ALONG[m]
+        s, e = s + start * offset[m], e + end * offset[m]
+    determinant = max(ss * ee - se * se, LEAST_DETERMINANT)
+    return (ee * s - se * e) / determinant, (ss * e - se * s) / determinant, ee / determinant, ss / determinant
 
 
-_BLACK_EDGES = np.array([[i for i, e in enumerate(EDGES) if e.layer == k and not e.frame] for k in range(len(LAYERS))])
-"""The edges (3, 4) of each layer's black square, clockwise from the top."""
-_PREVIOUS = np.array([3, 0, 1, 2])
-_LINE = np.stack([1 - ALONG, ALONG], axis=1)
-"""What the points of an edge feel (M, 2) of an offset at its start and at its end."""
-_LINE_MOMENTS = np.stack([_LINE[:, 0] ** 2, _LINE[:, 0] * _LINE[:, 1], _LINE[:, 1] ** 2], axis=1)
+@compiled(MATRIX, INDICES, MATRIX, MATRIX)
+def _corners(around_px: Array, rows: NDArray[np.int64], offset: Array, weight: Array) -> tuple[Array, float]:
+    """Return the corners (4, 2) of a square and their variance from its edges, ``rows`` (4,) of offsets (E, M).
+
+    ``around_px`` (12, 2) is where the corners are predicted, and the outlines a little before and after each.
+    """
+    corners, variance = np.empty((4, 2)), 0.0
+    for corner in range(4):
+        x, y = around_px[corner]
+        # two lines meet at a corner, the end of one edge and the start of the next: outward normals n and m
+        nx, ny = _outward(x - around_px[4 + corner, 0], y - around_px[4 + corner, 1])
+        mx, my = _outward(around_px[8 + corner, 0] - x, around_px[8 + corner, 1] - y)
+        before, after = rows[corner - 1], rows[corner]
+        _, a, _, variance_a = _edge_line(offset[before], weight[before])
+        b, _, variance_b, _ = _edge_line(offset[after], weight[after])
+        sine = nx * my - ny * mx
+        if abs(sine) <= LEAST_SINE:  # edges behind the camera meet far away
+            sine = LEAST_SINE
+        corners[corner, 0], corners[corner, 1] = x + (a * my - b * ny) / sine, y + (b * nx - a * mx) / sine
+        variance += (variance_a + variance_b) / (8 * sine * sine)
+    return corners, variance
+
+
+@compiled(array(REAL, 4), INDICES, MATRIX, MATRIX, MATRIX, VECTOR, INT, INT)
+def _measured(
+    around_px: Array,
+    edges: NDArray[np.int64],
+    offset: Array,
+    weight: Array,
+    shared: Array,
+    reach_px: Array,
+    height: int,
+    width: int,
+) -> tuple[Array, Array]:
+    """Return the corners (L, 4, 2) of the layers and their standard deviations (L,), inf of those not measured."""
+    layers = len(_BLACK_EDGES)
+    corners, sigma_px, nearest_px = np.zeros((layers, 4, 2)), np.full(layers, np.inf), np.zeros(layers)
+    rows = np.full((layers, 4), -1)
+    for layer in range(layers):
+        for row in range(len(edges)):
+            for side in range(4):
+                if edges[row] == _BLACK_EDGES[layer, side] and followed(weight[row]):
+                    rows[layer, side] = row
+        if (rows[layer] >= 0).all():
+            nearest_px[layer] = reach_px[rows[layer]].min()
+    sharp = nearest_px >= SHARP_REACH_PX
+    for layer in range(layers):
+        if nearest_px[layer] > 0 and (sharp[layer] or not sharp.any()):
+            square_px, variance = _corners(
+                np.ascontiguousarray(around_px[:, layer]).reshape(12, 2), rows[layer], offset, weight
+            )
+            x, y = square_px[:, 0], square_px[:, 1]
+            if min(x.min(), y.min()) >= 0 and x.max() <= width - 1 and y.max() <= height - 1:
+                points, common = 0, 0.0
+                for row in rows[layer]:
+                    points += np.count_nonzero(weight[row])
+                    common += shared[row].sum()
+                corners[layer] = square_px
+                sigma_px[layer] = np.sqrt(variance + common / points + CORNER_FLOOR_PX**2)
+    return corners, sigma_px

@@ -105,10 +105,10 @@ def locate(
     half = int(np.ceil((search_px + 3 * smoothing_px) / STEP_PX))
     lie = Lie(*_lie(warp(template.probes), template.to_paper, template.reach))
     in_view = _in_view(lie.predicted_px, warp.visible(template.few), half * STEP_PX, *light.shape)
-    profiles = _profiles(light, lie.predicted_px, lie.normal, half)
+    profiles, ink, paper = _profiles(light, lie.predicted_px, lie.normal, half)
     trusted_px = min(search_px, half * STEP_PX - 3 * smoothing_px + 0.3)
     offset_px, rise, beside = _steepest_rise(profiles, lie.reach_px, trusted_px, _derivative(smoothing_px))
-    found, alone, blur_px, clipped_px = _judged(profiles, offset_px, rise, beside, in_view, lie.reach_px)
+    found, alone, blur_px, clipped_px = _judged(ink, paper, offset_px, rise, beside, in_view, lie.reach_px)
     offset_px = np.where(found, offset_px, 0.0)
     return EdgePoints(edges, lie, offset_px, found, in_view, alone, blur_px, smoothing_px, clipped_px)
 
@@ -184,22 +184,26 @@ def interpolated(light: NDArray[np.float32], x: float, y: float) -> float:
 
 
 @compiled(LIGHT, CUBE, CUBE, INT)
-def _profiles(light: NDArray[np.float32], predicted_px: Array, normal: Array, half: int) -> Array:
-    """Return the light (E, M, 2 half + 1) every ``STEP_PX`` across edges, continued beyond the image as at its border.
+def _profiles(light: NDArray[np.float32], predicted_px: Array, normal: Array, half: int) -> tuple[Array, Array, Array]:
+    """Return the light (E, M, 2 half + 1) every ``STEP_PX`` across edges, and the least and the most of each (E, M).
 
-    Zeros where a warp gone astray predicts no place at all.
+    Continued beyond the image as at its border; zeros where a warp gone astray predicts no place at all.
     """
     _, edges, points = predicted_px.shape
     profiles = np.zeros((edges, points, 2 * half + 1))
+    ink, paper = np.zeros((edges, points)), np.zeros((edges, points))
     for e in range(edges):
         for m in range(points):
             x, y = predicted_px[0, e, m], predicted_px[1, e, m]
             if abs(x) < FAR_PX and abs(y) < FAR_PX:
+                step_x, step_y = STEP_PX * normal[0, e, m], STEP_PX * normal[1, e, m]
+                least, most = np.inf, -np.inf
                 for k in range(2 * half + 1):
-                    away = (k - half) * STEP_PX
-                    at_x, at_y = x + away * normal[0, e, m], y + away * normal[1, e, m]
-                    profiles[e, m, k] = interpolated(light, at_x, at_y)
-    return profiles
+                    value = interpolated(light, x + (k - half) * step_x, y + (k - half) * step_y)
+                    profiles[e, m, k] = value
+                    least, most = min(least, value), max(most, value)
+                ink[e, m], paper[e, m] = least, most
+    return profiles, ink, paper
 
 
 @compiled(CUBE, VECTOR, REAL, VECTOR)
@@ -224,8 +228,12 @@ def _steepest_rise(
             best = middle
             for k in range(middle - kept - 1, middle + kept + 2):
                 total = 0.0
-                for j in range(-reach, reach + 1):
-                    total += derivative[j + reach] * profiles[e, m, min(max(k + j, 0), samples - 1)]
+                if k >= reach and k + reach < samples:
+                    for j in range(2 * reach + 1):
+                        total += derivative[j] * profiles[e, m, k - reach + j]
+                else:
+                    for j in range(2 * reach + 1):
+                        total += derivative[j] * profiles[e, m, min(max(k - reach + j, 0), samples - 1)]
                 slope[k] = total
                 if abs(k - middle) <= kept and (k == middle - kept or total > slope[best]):
                     best = k
@@ -259,18 +267,16 @@ def _covered(ink: Array, paper: Array, reach_px: Array) -> Mask:
     return covered
 
 
-@compiled(CUBE, MATRIX, MATRIX, MATRIX, FLAG_MATRIX, VECTOR)
+@compiled(MATRIX, MATRIX, MATRIX, MATRIX, MATRIX, FLAG_MATRIX, VECTOR)
 def _judged(
-    profiles: Array, offset_px: Array, rise: Array, beside: Array, in_view: Mask, reach_px: Array
+    ink: Array, paper: Array, offset_px: Array, rise: Array, beside: Array, in_view: Mask, reach_px: Array
 ) -> tuple[Mask, Mask, float, Array]:
     """Return which points (E, M) are found and which of them stand alone, the blur, and how far clipping moved them."""
     edges, points = rise.shape
-    ink, paper = np.empty(rise.shape), np.empty(rise.shape)
     found, clipped_px = np.zeros(rise.shape, np.bool_), np.zeros(rise.shape)
     for e in range(edges):
         typical = 0.0
         for m in range(points):
-            ink[e, m], paper[e, m] = profiles[e, m].min(), profiles[e, m].max()
             typical += max(rise[e, m], 0.0) / max(paper[e, m], 1.0) / points
         for m in range(points):
             steep = rise[e, m] / max(paper[e, m], 1.0) > LEAST_RISE * typical and rise[e, m] > LEAST_RISE_GREY

@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.camera import Camera
+from astratag.camera import Camera, pixel
+from astratag.compiled import CUBE, MATRIX, VECTOR, compiled
 from astratag.detection import LayerDetection, PlanarPose
 from astratag.geometry import LAYERS, square
 from astratag.surface import Surface
@@ -22,6 +23,8 @@ Array = NDArray[np.float64]
 _SQUARES = [square(*layer.black) for layer in LAYERS]
 REFINEMENT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 6, 1e-8)
 MAX_STEPS = 30
+NEAREST_M = 1e-6
+"""A point behind the camera is taken for one so near: far outside every image."""
 HOPELESS_RATIO, HOPELESS_RMS_PX = 10.0, 1.0
 """A planar pose that fits the corners worse than the better one by this factor, and than this, is not refined."""
 UNSEEN = 1e-12
@@ -94,7 +97,7 @@ def planar_poses(
     if not starts:
         return ()
     points_marker = on_surface(surface, side_m, corners)[0]
-    squared_px = _squared_errors(camera, starts, points_marker, corners_px)
+    squared_px = _squared_errors(np.array(starts), points_marker, corners_px, camera.lens)
     rms_px = np.sqrt(squared_px.mean(axis=1))
     hopeless_px = max(HOPELESS_RMS_PX, HOPELESS_RATIO * min(rms_px))
     refine = [start is not known and rms <= hopeless_px for start, rms in zip(starts, rms_px.tolist(), strict=True)]
@@ -103,7 +106,7 @@ def planar_poses(
         for start, worth in zip(starts, refine, strict=True)
     ]
     if any(refine):
-        squared_px = _squared_errors(camera, poses, points_marker, corners_px)
+        squared_px = _squared_errors(np.array(poses), points_marker, corners_px, camera.lens)
         rms_px = np.sqrt(squared_px.mean(axis=1))
     misfit = squared_px @ np.repeat([seen.sigma_px**-2 for seen in layers], 4)
     likely = np.exp(-0.5 * (misfit - misfit.min()))
@@ -111,6 +114,7 @@ def planar_poses(
     return tuple(sorted((PlanarPose(*one) for one in found), key=lambda planar: -planar.probability))
 
 
+@compiled(MATRIX)
 def mirrored(T_cam_marker: Array) -> Array:
     """Return the pose that looks the same from so far that perspective does not tell them apart.
 
@@ -118,10 +122,12 @@ def mirrored(T_cam_marker: Array) -> Array:
     estimation from a planar target", PAMI 2006).
     """
     t = T_cam_marker[:3, 3]
-    towards = t / np.sqrt(t @ t)
-    R = T_cam_marker[:3, :3] - 2 * np.outer(towards, towards @ T_cam_marker[:3, :3])
-    R[:, 2] *= -1
-    return pose(R, t)
+    other, length2 = T_cam_marker.copy(), (t * t).sum()
+    for axis in range(3):
+        along = 2 * (t * T_cam_marker[:3, axis]).sum() / length2
+        other[:3, axis] = T_cam_marker[:3, axis] - along * t
+    other[:3, 2] *= -1
+    return other
 
 
 @lru_cache(maxsize=8)
@@ -132,14 +138,19 @@ def template_of_layers(layers: tuple[int, ...]) -> Array:
     return corners
 
 
-def _squared_errors(camera: Camera, poses: Sequence[Array], points_marker: Array, seen_px: Array) -> Array:
+@compiled(CUBE, MATRIX, MATRIX, VECTOR)
+def _squared_errors(poses: Array, points_marker: Array, seen_px: Array, lens: Array) -> Array:
     """Return how far points (3, N) of the marker are from where they are seen (N, 2) under P poses: (P, N) px^2."""
-    stacked = np.array(poses).reshape(-1, 4, 4)
-    points_cam = stacked[:, :3, :3] @ points_marker + stacked[:, :3, 3:]
-    points_cam[:, 2] = np.maximum(points_cam[:, 2], 1e-6)  # behind the camera is far outside every image
-    at = camera.project(points_cam.transpose(0, 2, 1)).T.reshape(2, len(stacked), -1)
-    off = at - seen_px.T[:, None]
-    return off[0] * off[0] + off[1] * off[1]
+    squared_px = np.empty((len(poses), len(seen_px)))
+    for p in range(len(poses)):
+        T = poses[p]
+        for i in range(len(seen_px)):
+            x, y, z = points_marker[0, i], points_marker[1, i], points_marker[2, i]
+            depth = max(T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3], NEAREST_M)
+            right = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+            u, v = pixel(right, T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3], depth, lens)
+            squared_px[p, i] = (u - seen_px[i, 0]) ** 2 + (v - seen_px[i, 1]) ** 2
+    return squared_px
 
 
 def _refined(camera: Camera, T_cam_marker: Array, points_marker: Array, seen_px: Array) -> Array:
