@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from astratag.compiled import FLAG_MATRIX, INDICES, INT, MATRIX, REAL, VECTOR, compiled
 from astratag.edges import POINTS_PER_EDGE, template_of
-from astratag.linear import inverse_of
+from astratag.linear import dot, inverse_of
 from astratag.locate import SMOOTHING_PX, EdgePoints, locate
 from astratag.neighbours import Crossings, narrowing, pull
 from astratag.warp import FittedWarp
@@ -399,17 +399,14 @@ def _robust_least_squares(
         for p in range(size):
             for i in range(points):
                 weighted[i] = A[p, i] * weight[i]
-                right[p] += weighted[i] * offset[i]
+            right[p] = dot(weighted, offset)
             for q in range(p + 1):
-                total = 0.0
-                for i in range(points):
-                    total += weighted[i] * A[q, i]
-                covariance[p, q] = covariance[q, p] = total
+                covariance[p, q] = covariance[q, p] = dot(weighted, A[q])
             covariance[p, p] += prior[p]
         covariance = inverse_of(covariance)
         residual[:] = offset
         for p in range(size):
-            x[p] = (covariance[p] * right).sum()
+            x[p] = dot(covariance[p], right)
             for i in range(points):
                 residual[i] -= x[p] * A[p, i]
         before_px, sigma_px = sigma_px, max(_spread(residual[quiet]), NOISE_FLOOR_PX)

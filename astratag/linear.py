@@ -5,9 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.compiled import MATRIX, compiled
+from astratag.compiled import MATRIX, VECTOR, compiled
 
 Array = NDArray[np.float64]
+
+
+@compiled(VECTOR, VECTOR)
+def dot(a: Array, b: Array) -> float:
+    """Return the sum of products of two vectors (N,)."""
+    total = 0.0
+    for i in range(len(a)):
+        total += a[i] * b[i]
+    return total
 
 
 @compiled(MATRIX)

@@ -106,20 +106,29 @@ def locate(
     lie = Lie(*_lie(warp(template.probes), template.to_paper, template.reach))
     in_view = _in_view(lie.predicted_px, warp.visible(template.few), half * STEP_PX, *light.shape)
     profiles, ink, paper = _profiles(light, lie.predicted_px, lie.normal, half)
-    trusted_px = min(search_px, half * STEP_PX - 3 * smoothing_px + 0.3)
-    offset_px, rise, beside = _steepest_rise(profiles, lie.reach_px, trusted_px, _derivative(smoothing_px))
+    limit_px = np.fmin(min(search_px, half * STEP_PX - 3 * smoothing_px + 0.3), WITHIN_REACH * lie.reach_px)
+    slopes = profiles @ _derivative(2 * half + 1, smoothing_px, int(limit_px.max() / STEP_PX) + 2)
+    offset_px, rise, beside = _steepest_rise(slopes, limit_px)
     found, alone, blur_px, clipped_px = _judged(ink, paper, offset_px, rise, beside, in_view, lie.reach_px)
     offset_px = np.where(found, offset_px, 0.0)
     return EdgePoints(edges, lie, offset_px, found, in_view, alone, blur_px, smoothing_px, clipped_px)
 
 
 @cache
-def _derivative(smoothing_px: float) -> Array:
-    """Return the filter (T,) that takes samples every ``STEP_PX`` to smoothed slopes a pixel."""
+def _derivative(samples: int, smoothing_px: float, kept: int) -> Array:
+    """Return the matrix (S, T) that takes profiles (..., S), continued at their ends, to smoothed slopes a pixel.
+
+    Of the slopes those in the middle are kept, ``kept`` to either side.
+    """
     reach = int(np.ceil(3.5 * smoothing_px / STEP_PX))
     x = np.arange(-reach, reach + 1) * STEP_PX
     kernel = x * np.exp(-0.5 * (x / smoothing_px) ** 2)
-    return kernel / (kernel @ x)
+    kernel /= kernel @ x
+    matrix = np.zeros((samples, samples))
+    for column in range(samples):
+        np.add.at(matrix[:, column], np.clip(np.arange(column - reach, column + reach + 1), 0, samples - 1), kernel)
+    middle = samples // 2
+    return np.ascontiguousarray(matrix[:, middle - kept : middle + kept + 1])
 
 
 @compiled(CUBE, VECTOR, VECTOR)
@@ -173,9 +182,8 @@ def _in_view(predicted_px: Array, facing: Mask, profile_px: float, height: int, 
 
 @compiled(LIGHT, REAL, REAL)
 def interpolated(light: NDArray[np.float32], x: float, y: float) -> float:
-    """Return the light between four pixels, beyond the image as at its border."""
+    """Return the light between four pixels; ``x`` and ``y`` are within the image."""
     height, width = light.shape
-    x, y = min(max(x, 0.0), width - 1.0), min(max(y, 0.0), height - 1.0)
     column, row = min(int(x), width - 2), min(int(y), height - 2)
     x, y = x - column, y - row
     above = light[row, column] + x * (light[row, column + 1] - light[row, column])
@@ -190,6 +198,7 @@ def _profiles(light: NDArray[np.float32], predicted_px: Array, normal: Array, ha
     Continued beyond the image as at its border; zeros where a warp gone astray predicts no place at all.
     """
     _, edges, points = predicted_px.shape
+    bottom, right = light.shape[0] - 1.0, light.shape[1] - 1.0
     profiles = np.zeros((edges, points, 2 * half + 1))
     ink, paper = np.zeros((edges, points)), np.zeros((edges, points))
     for e in range(edges):
@@ -199,48 +208,36 @@ def _profiles(light: NDArray[np.float32], predicted_px: Array, normal: Array, ha
                 step_x, step_y = STEP_PX * normal[0, e, m], STEP_PX * normal[1, e, m]
                 least, most = np.inf, -np.inf
                 for k in range(2 * half + 1):
-                    value = interpolated(light, x + (k - half) * step_x, y + (k - half) * step_y)
+                    at_x = min(max(x + (k - half) * step_x, 0.0), right)
+                    at_y = min(max(y + (k - half) * step_y, 0.0), bottom)
+                    value = interpolated(light, at_x, at_y)
                     profiles[e, m, k] = value
                     least, most = min(least, value), max(most, value)
                 ink[e, m], paper[e, m] = least, most
     return profiles, ink, paper
 
 
-@compiled(CUBE, VECTOR, REAL, VECTOR)
-def _steepest_rise(
-    profiles: Array, reach_px: Array, trusted_px: float, derivative: Array
-) -> tuple[Array, Array, Array]:
-    """Return where (E, M) profiles (E, M, S) rise most, in pixels from their middle, and how steeply there.
+@compiled(CUBE, VECTOR)
+def _steepest_rise(slopes: Array, limit_px: Array) -> tuple[Array, Array, Array]:
+    """Return where (E, M) slopes (E, M, T) are steepest, in pixels from their middle, and how steep there.
 
-    Also the product of the slopes a step before and after.  ``derivative`` is the smoothed one's filter.
-    The place is NaN where the steepest rise lies at the limit of the search: it is something else's.
+    Also the product of the slopes a step before and after.
+    The place is NaN where it lies at the limit (E,) of the search: it is something else's.
     """
-    edges, points, samples = profiles.shape
-    reach, middle = len(derivative) // 2, samples // 2
+    edges, points, steps = slopes.shape
     place, rise, beside = (np.full((edges, points), np.nan), np.empty((edges, points)), np.empty((edges, points)))
-    slope = np.empty(samples)
     for e in range(edges):
-        limit_px = trusted_px
-        if WITHIN_REACH * reach_px[e] < trusted_px:
-            limit_px = WITHIN_REACH * reach_px[e]
-        kept = int((max(limit_px, 0.0) + 1e-9) / STEP_PX)
+        kept = int((limit_px[e] + 1e-9) / STEP_PX)
         for m in range(points):
-            best = middle
-            for k in range(middle - kept - 1, middle + kept + 2):
-                total = 0.0
-                if k >= reach and k + reach < samples:
-                    for j in range(2 * reach + 1):
-                        total += derivative[j] * profiles[e, m, k - reach + j]
-                else:
-                    for j in range(2 * reach + 1):
-                        total += derivative[j] * profiles[e, m, min(max(k - reach + j, 0), samples - 1)]
-                slope[k] = total
-                if abs(k - middle) <= kept and (k == middle - kept or total > slope[best]):
+            best = steps // 2 - kept
+            for k in range(best + 1, steps // 2 + kept + 1):
+                if slopes[e, m, k] > slopes[e, m, best]:
                     best = k
-            below, peak, above = slope[best - 1], slope[best], slope[best + 1]
+            below, peak, above = slopes[e, m, best - 1], slopes[e, m, best], slopes[e, m, best + 1]
             rise[e, m], beside[e, m] = peak, below * above
             if below < peak and above <= peak:
-                place[e, m] = (best - middle + 0.5 * (above - below) / (2 * peak - below - above)) * STEP_PX
+                at = best - steps // 2 + 0.5 * (above - below) / (2 * peak - below - above)
+                place[e, m] = at * STEP_PX
     return place, rise, beside
 
 
