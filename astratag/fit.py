@@ -141,7 +141,7 @@ def _cost(A: Array, left: Array, x: Array, in_view: Mask, reach_px: Array) -> tu
         truncated += min((residual[i] / COST_UNIT_PX) ** 2, COST_CAP)
     for e in range(len(reach_px)):
         if reach_px[e] >= SHARP_REACH_PX:
-            sharp += np.count_nonzero(in_view[e])
+            sharp += int(np.count_nonzero(in_view[e]))
     in_all = max(sharp, len(left))
     return residual, (truncated + COST_CAP * (in_all - len(left))) / in_all
 
@@ -253,7 +253,7 @@ def _usable(found: Mask, in_view: Mask, reach_px: Array) -> Mask:
     """Return which points (E, M) to use: those of edges mostly found and not too near their neighbours."""
     use = np.zeros(found.shape, np.bool_)
     for e in range(len(found)):
-        least = LEAST_FOUND * max(np.count_nonzero(in_view[e]), LEAST_IN_VIEW * POINTS_PER_EDGE)
+        least = LEAST_FOUND * max(float(np.count_nonzero(in_view[e])), LEAST_IN_VIEW * POINTS_PER_EDGE)
         if np.count_nonzero(found[e]) >= least and reach_px[e] >= LEAST_REACH_PX:
             use[e] = found[e]
     return use
@@ -266,13 +266,13 @@ def _on_all_sides(edges: NDArray[np.int64], use: Mask) -> bool:
     for e in range(len(edges)):
         if np.count_nonzero(use[e]) >= LEAST_ON_SIDE:
             followed[edges[e] % 4] = True
-    return followed.all()
+    return bool(followed.all())
 
 
 @compiled(VECTOR)
 def followed(weight: Array) -> bool:
     """Return whether a fit follows an edge, by the weights of its points (M,)."""
-    return np.count_nonzero(weight) >= LEAST_FOUND * POINTS_PER_EDGE
+    return bool(np.count_nonzero(weight) >= LEAST_FOUND * POINTS_PER_EDGE)
 
 
 def follows_all_sides(fit: EdgeFit[W]) -> bool:

@@ -22,6 +22,8 @@ SETTLED_PX, MAX_SETTLING = 0.5, 4
 MAX_SEARCH_PX = 12.0
 CURVED_GAIN = 0.6
 """A bend is believed when it lowers the cost of the fit below this fraction."""
+SURELY_FLAT = 0.02
+"""Cost of a plane's fit, 0.07 pixels RMS, below which no bend is looked for."""
 
 
 def layer_side_px(warp: FittedWarp, layer: int) -> float:
@@ -43,7 +45,7 @@ def grow(light: Light, warp: FittedWarp, layer: int, near: Crossings) -> Fit | N
     """
     search_px = _search_px(warp, layer, 0.02)
     flat = _grow_through(light, warp, layer, search_px, near)
-    if not isinstance(warp, HomographyWarp):
+    if not isinstance(warp, HomographyWarp) or (flat is not None and flat.cost < SURELY_FLAT):
         return flat
     bent = _grow_through(light, BentWarp(warp, np.zeros((2, 3))), layer, search_px, near)
     if flat is None or bent is None:

@@ -128,7 +128,7 @@ def _measured(
             if min(x.min(), y.min()) >= 0 and x.max() <= width - 1 and y.max() <= height - 1:
                 points, common = 0, 0.0
                 for row in rows[layer]:
-                    points += np.count_nonzero(weight[row])
+                    points += int(np.count_nonzero(weight[row]))
                     common += shared[row].sum()
                 corners[layer] = square_px
                 sigma_px[layer] = np.sqrt(variance + common / points + CORNER_FLOOR_PX**2)

@@ -14,9 +14,10 @@ from astratag.camera import Camera, pixel
 from astratag.compiled import CUBE, MATRIX, VECTOR, compiled
 from astratag.detection import LayerDetection, PlanarPose
 from astratag.geometry import LAYERS, square
+from astratag.linear import inverse_of
 from astratag.surface import Surface
-from astratag.transforms import pose
-from astratag.warp import PoseWarp, on_surface
+from astratag.transforms import perturbed, pose
+from astratag.warp import PoseWarp, on_surface, pose_jacobian, seen_from
 
 Array = NDArray[np.float64]
 
@@ -31,6 +32,7 @@ UNSEEN = 1e-12
 """Information, as a fraction of the best, that is taken to be there where the corners do not fix the pose at all."""
 LEAST_SCALE = 1e-12
 """Added to pixels per metre and per radian, so that none is zero."""
+FIRST_DAMPING, MOST_DAMPING = 1e-3, 1e6
 CONVERGED_PX2 = 1e-9
 """Stop when the squared error, in sigmas, no longer falls by this fraction."""
 
@@ -177,34 +179,56 @@ def refine_on_corners(start: PoseWarp, layers: Sequence[LayerDetection]) -> Corn
     """
     template = template_of_layers(tuple(seen.layer for seen in layers))
     corners_px = np.concatenate([seen.corners_px for seen in layers])
-    sigma_px = np.repeat([seen.sigma_px for seen in layers], 8)
-    warp, damping = start, 1e-3
+    sigma_px = np.repeat([seen.sigma_px for seen in layers], 4)
+    points_marker = on_surface(start.surface, start.side_m, template)[0]
+    T, covariance, rms_px = _adjusted(start.T_cam_marker, points_marker, corners_px, sigma_px, start.camera.lens)
+    return CornerPose(T, covariance, float(rms_px))
 
-    def error(candidate: PoseWarp) -> Array:
-        return (corners_px - candidate(template)).ravel() / sigma_px
 
-    def scaled(candidate: PoseWarp) -> tuple[Array, Array]:
-        J = candidate.jacobian(template).reshape(-1, 6) / sigma_px[:, None]
-        scale = np.linalg.norm(J, axis=0) + LEAST_SCALE  # metres and radians differ by orders: solve in pixels
-        return J / scale, scale
+@compiled(MATRIX, MATRIX, MATRIX, VECTOR, VECTOR)
+def _normal_equations(
+    T_cam_marker: Array, points_marker: Array, seen_px: Array, sigma_px: Array, lens: Array
+) -> tuple[Array, Array, float]:
+    """Return normal matrix (6, 6), right side (6,) and squared error of points (3, N) seen at (N, 2), in sigmas."""
+    J = pose_jacobian(points_marker, T_cam_marker, lens)
+    at = seen_from(points_marker, T_cam_marker, lens, 0.0)
+    normal, right, squared = np.zeros((6, 6)), np.zeros(6), 0.0
+    for i in range(len(seen_px)):
+        for axis in range(2):
+            residual = (seen_px[i, axis] - at[i, axis]) / sigma_px[i]
+            squared += residual * residual
+            for p in range(6):
+                right[p] += J[i, axis, p] * residual / sigma_px[i]
+                for q in range(6):
+                    normal[p, q] += J[i, axis, p] * J[i, axis, q] / sigma_px[i] ** 2
+    return normal, right, squared
 
-    residual = error(warp)
+
+@compiled(MATRIX, MATRIX, MATRIX, VECTOR, VECTOR)
+def _adjusted(
+    T_cam_marker: Array, points_marker: Array, seen_px: Array, sigma_px: Array, lens: Array
+) -> tuple[Array, Array, float]:
+    """Return the pose nearest to points (3, N) seen at (N, 2) within ``sigma_px`` (N,), its covariance, and RMS."""
+    T, damping = T_cam_marker.copy(), FIRST_DAMPING
+    normal, right, squared = _normal_equations(T, points_marker, seen_px, sigma_px, lens)
     for _ in range(MAX_STEPS):
-        J, scale = scaled(warp)
-        delta = np.linalg.solve(J.T @ J + damping * np.eye(6), J.T @ residual)
-        moved = warp.stepped(delta / scale)
-        after = error(moved)
-        gain = residual @ residual - after @ after
-        if gain <= 0:
+        scale = np.sqrt(np.diag(normal)) + LEAST_SCALE  # metres and radians differ by orders: solve in pixels
+        damped = normal / np.outer(scale, scale) + damping * np.eye(6)
+        step = (inverse_of(damped) * (right / scale)).sum(axis=1) / scale
+        moved = perturbed(T, step)
+        after = _normal_equations(moved, points_marker, seen_px, sigma_px, lens)
+        gain = squared - after[2]
+        if not gain > 0:
             damping *= 10
-            if damping > 1e6:
+            if damping > MOST_DAMPING:
                 break
             continue
-        warp, residual, damping = moved, after, damping / 10
-        if gain <= CONVERGED_PX2 * (1 + after @ after):
+        T, damping = moved, damping / 10
+        normal, right, squared = after
+        if gain <= CONVERGED_PX2 * (1 + squared):
             break
-    misfit = max(1.0, float(residual @ residual) / max(len(residual) - 6, 1))
-    J, scale = scaled(warp)
-    covariance = misfit * np.linalg.inv(J.T @ J + UNSEEN * np.eye(6)) / np.outer(scale, scale)
-    reprojection_rms_px = float(np.sqrt(((residual * sigma_px) ** 2).reshape(-1, 2).sum(axis=1).mean()))
-    return CornerPose(warp.T_cam_marker, covariance, reprojection_rms_px)
+    misfit = max(1.0, squared / max(2 * len(seen_px) - 6, 1))
+    scale = np.sqrt(np.diag(normal)) + LEAST_SCALE
+    covariance = misfit * inverse_of(normal / np.outer(scale, scale) + UNSEEN * np.eye(6)) / np.outer(scale, scale)
+    off = seen_px - seen_from(points_marker, T, lens, 0.0)
+    return T, covariance, np.sqrt((off * off).sum() / len(seen_px))

@@ -17,6 +17,9 @@ from astratag.compiled import MATRIX, VECTOR, compiled
 
 Array = NDArray[np.float64]
 
+SMALL_ANGLE_RAD = 1e-4
+"""Below it the series are exact to the last digit."""
+
 
 def pose(R_a_b: ArrayLike, t_a_b_m: ArrayLike) -> Array:
     """Return T_a_b (4, 4) from a rotation (3, 3) and a translation (3,)."""
@@ -59,7 +62,7 @@ def skew(v: ArrayLike) -> Array:
 
 def perturb(T_a_b: Array, xi: ArrayLike) -> Array:
     """Return T_a_b moved by xi = (rho m, theta rad) (6,) in the axes of b."""
-    return _perturbed(np.ascontiguousarray(T_a_b, dtype=float), np.ascontiguousarray(xi, dtype=float))
+    return perturbed(np.ascontiguousarray(T_a_b, dtype=float), np.ascontiguousarray(xi, dtype=float))
 
 
 def difference(T_a_b: Array, T_a_b_hat: Array) -> Array:
@@ -92,12 +95,8 @@ def rotation_from_wxyz(rotation_wxyz: ArrayLike) -> Array:
     return Rotation.from_quat(np.asarray(rotation_wxyz, dtype=float), scalar_first=True).as_matrix()
 
 
-SMALL_ANGLE_RAD = 1e-4
-"""Below it the series are exact to the last digit."""
-
-
 @compiled(MATRIX, VECTOR)
-def _perturbed(T_a_b: Array, xi: Array) -> Array:
+def perturbed(T_a_b: Array, xi: Array) -> Array:
     """Return ``perturb``: Rodrigues' formula, and a product of transforms."""
     x, y, z = xi[3], xi[4], xi[5]
     angle2 = x * x + y * y + z * z

@@ -214,12 +214,12 @@ class PoseWarp:
     def __call__(self, template: Array) -> Array:
         """Return pixels (..., 2)."""
         points_marker, nearest_m = self._marker(template)[0], NEAREST_SIDES * self.side_m
-        at = _seen(points_marker, self.T_cam_marker, self.camera.lens, nearest_m)
+        at = seen_from(points_marker, self.T_cam_marker, self.camera.lens, nearest_m)
         return at.reshape(np.shape(template))
 
     def jacobian(self, template: Array) -> Array:
         """Return the derivative (N, 2, 6) by a right perturbation of the pose, metres then radians."""
-        return _pose_jacobian(self._marker(template)[0], self.T_cam_marker, self.camera.lens)
+        return pose_jacobian(self._marker(template)[0], self.T_cam_marker, self.camera.lens)
 
     def slopes(self, template: Array, along: Array) -> Array:
         """Return the derivative (6, N) along unit vectors (2, N)."""
@@ -302,7 +302,7 @@ def _in_camera(points_marker: Array, T: Array) -> Array:
 
 
 @compiled(MATRIX, MATRIX, VECTOR, REAL)
-def _seen(points_marker: Array, T_cam_marker: Array, lens: Array, nearest_m: float) -> Array:
+def seen_from(points_marker: Array, T_cam_marker: Array, lens: Array, nearest_m: float) -> Array:
     """Return the pixels (N, 2) of points (3, N), those not before the camera outside every image."""
     x, y, z = _in_camera(points_marker, T_cam_marker)
     at = np.empty((len(x), 2))
@@ -331,7 +331,7 @@ def _pose_slopes(points_marker: Array, T_cam_marker: Array, lens: Array, along: 
 
 
 @compiled(MATRIX, MATRIX, VECTOR)
-def _pose_jacobian(points_marker: Array, T_cam_marker: Array, lens: Array) -> Array:
+def pose_jacobian(points_marker: Array, T_cam_marker: Array, lens: Array) -> Array:
     """Return the derivative (N, 2, 6) of the pixels of points (3, N) by a right perturbation of the pose."""
     J = np.empty((points_marker.shape[1], 2, 6))
     for axis in range(2):
