@@ -123,27 +123,22 @@ class BentWarp:
     flat: HomographyWarp
     bend: Array
 
-    def _terms(self, template: Array) -> Array:
-        u = _normalised(template)
-        return np.stack([u[..., 0] ** 2, u[..., 0] * u[..., 1], u[..., 1] ** 2], axis=-1)
-
     def __call__(self, template: Array) -> Array:
         """Return pixels (..., 2)."""
-        return self.flat(template) + self._terms(template) @ self.bend.T
+        points = _listed(template)
+        return (_through_plane(points, self.flat.H) + _bend_terms(points) @ self.bend.T).reshape(np.shape(template))
 
     def jacobian(self, template: Array) -> Array:
         """Return the derivative (N, 2, 14): eight of the homography, then the bend by rows."""
-        terms = self._terms(template)
-        J = np.zeros((len(terms), 2, 14))
-        J[:, :, :8] = self.flat.jacobian(template)
-        J[:, 0, 8:11] = terms
-        J[:, 1, 11:14] = terms
+        points = _listed(template)
+        J = np.zeros((len(points), 2, 14))
+        J[:, :, :8] = _plane_jacobian(points, self.flat.H)
+        J[:, 0, 8:11] = J[:, 1, 11:14] = _bend_terms(points)
         return J
 
     def slopes(self, template: Array, along: Array) -> Array:
         """Return the derivative (14, N) along unit vectors (2, N)."""
-        terms = self._terms(template).T
-        return np.concatenate([self.flat.slopes(template, along), along[0] * terms, along[1] * terms])
+        return slopes_of(self.jacobian(template), np.ascontiguousarray(along))
 
     def stepped(self, delta: Array) -> BentWarp:
         """Return both parts moved."""
@@ -278,6 +273,16 @@ def _plane_jacobian(template: Array, H: Array) -> Array:
             J[i, axis, 6] = -at * u / depth
             J[i, axis, 7] = -at * v / depth
     return J
+
+
+@compiled(MATRIX)
+def _bend_terms(template: Array) -> Array:
+    """Return u^2, uv and v^2 (N, 3) of template points (N, 2), the print spanning -1..1."""
+    terms = np.empty((len(template), 3))
+    for i in range(len(template)):
+        u, v = template[i, 0] / (TEMPLATE_UNITS / 2) - 1.0, template[i, 1] / (TEMPLATE_UNITS / 2) - 1.0
+        terms[i, 0], terms[i, 1], terms[i, 2] = u * u, u * v, v * v
+    return terms
 
 
 @compiled(CUBE, MATRIX)
