@@ -14,9 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import brentq
-from scipy.special import betainc, betaincinv
-from scipy.stats import binom
+from scipy.special import bdtr, betainc, betaincinv
 
 from astratag.checks import finite, numbers, whole
 from astratag.geometry import CELLS
@@ -63,6 +61,8 @@ def effective_cells(best: ArrayLike, templates: int, warps: int = 1) -> float:
     frequent accepts are extrapolated by whoever puts the result into ``acceptance_threshold``.
     Raises ValueError for fewer than a thousand candidates.
     """
+    from scipy.optimize import brentq  # half a second, for what is done once
+
     best = numbers(best, "best")
     if best.ndim != 1 or len(best) < 10 * TAIL:
         raise ValueError(f"best must be at least {10 * TAIL} correlations, one a candidate, got {best.shape}")
@@ -81,7 +81,7 @@ def hamming_false_accept_rate(tau: int, templates: int, warps: int = 1, cells: i
     """
     _check(templates, warps)
     whole(tau, "tau")
-    return float(min(templates * warps * binom.cdf(tau, cells, 0.5), 1.0))
+    return float(min(templates * warps * bdtr(tau, cells, 0.5), 1.0))
 
 
 def hamming_threshold(templates: int, warps: int = 1, false_accept_rate: float = FALSE_ACCEPT_RATE) -> int | None:
