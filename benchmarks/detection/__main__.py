@@ -101,17 +101,15 @@ def show_cost(rows: Sequence[dict]) -> None:
 
 
 def show_profile(rows: Sequence[dict]) -> None:
-    """Print how a search's CPU time divides between OpenCV, which a native core would keep, and all around it."""
-    table = Table(
-        title="A search, CPU ms: OpenCV's own, and the Python and NumPy around it", title_justify="left", box=None
-    )
-    for heading in ("", "all", "OpenCV", "around it", "most of OpenCV's"):
+    """Print how a search's CPU time divides between OpenCV, the compiled functions, and the Python around them."""
+    table = Table(title="A search, CPU ms", title_justify="left", box=None)
+    for heading in ("", "all", "OpenCV", "compiled", "Python", "most of OpenCV's", "most of the compiled"):
         table.add_column(heading)
     for row in rows:
-        opencv = row["opencv_share"] * row["cpu_ms"]
-        most = ", ".join(f"{name} {ms:.2f}" for name, ms in list(row["opencv_ms"].items())[:4])
-        around = f"{row['cpu_ms'] - opencv:.2f} ({1 - row['opencv_share']:.0%})"
-        table.add_row(row["image"], f"{row['cpu_ms']:.2f}", f"{opencv:.2f} ({row['opencv_share']:.0%})", around, most)
+        native = [sum(row[kind].values()) for kind in ("OpenCV", "compiled")]
+        parts = (f"{ms:.2f} ({ms / row['cpu_ms']:.0%})" for ms in (*native, row["cpu_ms"] - sum(native)))
+        most = (", ".join(f"{f} {ms:.2f}" for f, ms in list(row[kind].items())[:3]) for kind in ("OpenCV", "compiled"))
+        table.add_row(row["image"], f"{row['cpu_ms']:.2f}", *parts, *most)
     CONSOLE.print(table)
 
 
