@@ -3,11 +3,20 @@
 Signatures are given, so that all is compiled when the package is first imported on a machine, kept beside the source,
 and only loaded from then on: nothing is compiled in flight.  Arrays must have the type that a signature says, and be
 in C order; another one raises a TypeError.
+
+Numba by itself would not notice a change in what a function calls, or in a constant it uses, in another file.  So what
+it keeps is kept under a digest of all sources that compiled functions may draw on.
 """
 
 from __future__ import annotations
 
+import hashlib
+import os
+import re
+import shutil
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
@@ -17,6 +26,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 BOOL, INT, REAL = types.boolean, types.int64, types.float64
 
+PREFIX = "compiled-"
 SUMS_IN_ANY_ORDER = {"reassoc", "contract"}
 
 
@@ -40,7 +50,56 @@ def compiled(*arguments: types.Type) -> Callable[[F], F]:
     """
 
     def decorate(function: F) -> F:
-        machine_code: Any = numba.njit(arguments, cache=True, error_model="numpy", fastmath=SUMS_IN_ANY_ORDER)(function)
+        config: Any = numba.config
+        others = config.CACHE_DIR
+        try:
+            config.CACHE_DIR = str(_folder())
+            machine_code: Any = numba.njit(arguments, cache=True, error_model="numpy", fastmath=SUMS_IN_ANY_ORDER)(
+                function
+            )
+        finally:
+            config.CACHE_DIR = others
         return machine_code
 
     return decorate
+
+
+@cache
+def _folder() -> Path:
+    """Return where machine code of these sources is kept: beside them, or else in the user's cache.
+
+    What was kept of other versions is removed.
+    """
+    package = Path(__file__).parent
+    digest = hashlib.sha256("".join(_sources(package)).encode())
+    name = f"{PREFIX}{digest.hexdigest()[:16]}"
+    caches = package / "__pycache__", Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "astratag"
+    for folder in caches:
+        try:
+            (folder / name).mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(folder / name, os.W_OK):
+            for old in folder.glob(f"{PREFIX}*"):
+                if old.name != name:
+                    shutil.rmtree(old, ignore_errors=True)
+            return folder / name
+    raise OSError(f"nowhere to keep compiled functions: neither {caches[0]} nor {caches[1]} can be written to")
+
+
+def _sources(package: Path) -> list[str]:
+    """Return the texts of all modules that have compiled functions, and of those that they import."""
+    texts = {source.relative_to(package): source.read_text() for source in sorted(package.rglob("*.py"))}
+    names = {".".join(path.with_suffix("").parts): path for path in texts}
+    wanted = {path for path, text in texts.items() if "from astratag.compiled import" in text}
+    while (
+        new := {
+            names[imported]
+            for path in wanted
+            for imported in re.findall(r"^from astratag\.([\w.]+) import", texts[path], re.MULTILINE)
+            if imported in names
+        }
+        - wanted
+    ):
+        wanted |= new
+    return [texts[path] for path in sorted(wanted)]
