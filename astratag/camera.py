@@ -186,7 +186,7 @@ def _project(points_cam: Array, lens: Array) -> Array:
     """Return the pixels (N, 2) of points (N, 3)."""
     at = np.empty((len(points_cam), 2))
     for i in range(len(points_cam)):
-        at[i] = pixel(points_cam[i, 0], points_cam[i, 1], points_cam[i, 2], lens)
+        at[i, 0], at[i, 1] = pixel(points_cam[i, 0], points_cam[i, 1], points_cam[i, 2], lens)
     return at
 
 

@@ -13,9 +13,9 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.compiled import FLAG_MATRIX, INDICES, INT, MATRIX, REAL, VECTOR, compiled
+from astratag.compiled import FLAG_MATRIX, FLAGS, INDICES, INT, MATRIX, REAL, VECTOR, compiled
 from astratag.edges import POINTS_PER_EDGE, template_of
-from astratag.linear import dot, inverse_of
+from astratag.linear import dot, inverse_of, ranked
 from astratag.locate import SMOOTHING_PX, EdgePoints, locate
 from astratag.neighbours import Crossings, narrowing, pull
 from astratag.warp import FittedWarp
@@ -367,11 +367,15 @@ def _of_tukey(u2: Array, unknowns: int) -> float:
     return max(promised, 1.0)
 
 
-@compiled(VECTOR)
-def _spread(residual: Array) -> float:
-    """Return the robust standard deviation: 1.4826 times the median absolute residual."""
-    middle = len(residual) // 2
-    return 1.4826 * np.partition(np.abs(residual), middle)[middle]
+@compiled(VECTOR, FLAGS)
+def _spread(residual: Array, quiet: Mask) -> float:
+    """Return the robust standard deviation of the quiet residuals: 1.4826 times their median absolute value."""
+    size, count = np.empty(len(residual)), 0
+    for i in range(len(residual)):
+        if quiet[i]:
+            size[count] = abs(residual[i])
+            count += 1
+    return 1.4826 * ranked(size[:count], count // 2)
 
 
 @compiled(MATRIX, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR)
@@ -383,14 +387,16 @@ def _robust_least_squares(
     ``A`` (P, N) has a row for each unknown.  Returns the fields of ``_Solution``.
     """
     size, points = A.shape
-    A, offset, common = A * keen, offset * keen, common * (keen * keen)  # now all points are as noisy
+    A, offset, common = A.copy(), offset * keen, common * (keen * keen)
     scale, prior = np.empty(size), np.empty(size)
     for p in range(size):  # metres and radians differ by orders: solve in pixels
-        scale[p] = np.sqrt((A[p] * A[p]).sum()) + 1e-12
-        A[p] /= scale[p]
+        for i in range(points):
+            A[p, i] *= keen[i]  # now all points are as noisy
+        scale[p] = np.sqrt(dot(A[p], A[p])) + 1e-12
+        for i in range(points):
+            A[p, i] /= scale[p]
         prior[p] = 1 / (prior_sigma[p] * scale[p]) ** 2 + 1e-9
-    middle = points // 2
-    quiet = common <= np.partition(common, middle)[middle]
+    quiet = common <= ranked(common, points // 2)
     sigma_px = FIRST_SIGMA_PX
     weight, u2, residual, x = 1 / (sigma_px**2 / share + common), np.empty(points), np.empty(points), np.empty(size)
     covariance, weighted = np.empty((size, size)), np.empty(points)
@@ -409,7 +415,7 @@ def _robust_least_squares(
             x[p] = dot(covariance[p], right)
             for i in range(points):
                 residual[i] -= x[p] * A[p, i]
-        before_px, sigma_px = sigma_px, max(_spread(residual[quiet]), NOISE_FLOOR_PX)
+        before_px, sigma_px = sigma_px, max(_spread(residual, quiet), NOISE_FLOOR_PX)
         for i in range(points):
             u2[i] = min(residual[i] ** 2 / (TUKEY**2 * (sigma_px**2 + common[i] / POINTS_PER_EDGE)), 1.0)
         if reweighted and abs(sigma_px - before_px) <= SAME_SPREAD * before_px:

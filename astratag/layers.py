@@ -73,18 +73,20 @@ def _edge_line(offset: Array, weight: Array) -> tuple[float, float, float, float
     return (ee * s - se * e) / determinant, (ss * e - se * s) / determinant, ee / determinant, ss / determinant
 
 
-@compiled(MATRIX, INDICES, MATRIX, MATRIX)
-def _corners(around_px: Array, rows: NDArray[np.int64], offset: Array, weight: Array) -> tuple[Array, float]:
-    """Return the corners (4, 2) of a square and their variance from its edges, ``rows`` (4,) of offsets (E, M).
+@compiled(array(REAL, 4), INT, INDICES, MATRIX, MATRIX)
+def _corners(
+    around_px: Array, layer: int, rows: NDArray[np.int64], offset: Array, weight: Array
+) -> tuple[Array, float]:
+    """Return the corners (4, 2) of a layer's square and their variance from its edges, ``rows`` (4,) of offsets (E, M).
 
-    ``around_px`` (12, 2) is where the corners are predicted, and the outlines a little before and after each.
+    ``around_px`` (3, L, 4, 2) is where corners are predicted, and the outlines a little before and after each.
     """
     corners, variance = np.empty((4, 2)), 0.0
     for corner in range(4):
-        x, y = around_px[corner]
+        x, y = around_px[0, layer, corner]
         # two lines meet at a corner, the end of one edge and the start of the next: outward normals n and m
-        nx, ny = _outward(x - around_px[4 + corner, 0], y - around_px[4 + corner, 1])
-        mx, my = _outward(around_px[8 + corner, 0] - x, around_px[8 + corner, 1] - y)
+        nx, ny = _outward(x - around_px[1, layer, corner, 0], y - around_px[1, layer, corner, 1])
+        mx, my = _outward(around_px[2, layer, corner, 0] - x, around_px[2, layer, corner, 1] - y)
         before, after = rows[corner - 1], rows[corner]
         _, a, _, variance_a = _edge_line(offset[before], weight[before])
         b, _, variance_b, _ = _edge_line(offset[after], weight[after])
@@ -116,16 +118,17 @@ def _measured(
             for side in range(4):
                 if edges[row] == _BLACK_EDGES[layer, side] and followed(weight[row]):
                     rows[layer, side] = row
-        if (rows[layer] >= 0).all():
-            nearest_px[layer] = reach_px[rows[layer]].min()
-    sharp = nearest_px >= SHARP_REACH_PX
+        nearest_px[layer] = np.inf
+        for side in range(4):
+            nearest_px[layer] = min(nearest_px[layer], reach_px[rows[layer, side]] if rows[layer, side] >= 0 else 0.0)
+    least_px = SHARP_REACH_PX if nearest_px.max() >= SHARP_REACH_PX else 0.0
     for layer in range(layers):
-        if nearest_px[layer] > 0 and (sharp[layer] or not sharp.any()):
-            square_px, variance = _corners(
-                np.ascontiguousarray(around_px[:, layer]).reshape(12, 2), rows[layer], offset, weight
-            )
-            x, y = square_px[:, 0], square_px[:, 1]
-            if min(x.min(), y.min()) >= 0 and x.max() <= width - 1 and y.max() <= height - 1:
+        if nearest_px[layer] > 0 and nearest_px[layer] >= least_px:
+            square_px, variance = _corners(around_px, layer, rows[layer], offset, weight)
+            inside = True
+            for x, y in square_px:
+                inside &= 0 <= x <= width - 1 and 0 <= y <= height - 1
+            if inside:
                 points, common = 0, 0.0
                 for row in rows[layer]:
                     points += int(np.count_nonzero(weight[row]))

@@ -1,11 +1,14 @@
-"""Small systems of linear equations, for compiled functions: as large as a warp has parameters."""
+"""What compiled functions share: small systems of linear equations, as large as a warp has parameters, and ranks.
+
+NumPy's own would do, but take Numba seconds to compile.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.compiled import MATRIX, VECTOR, compiled
+from astratag.compiled import INT, MATRIX, VECTOR, compiled
 
 Array = NDArray[np.float64]
 
@@ -54,3 +57,27 @@ def inverse_of(S: Array) -> Array:
         for j in range(i, size):
             inverse[i, j] = inverse[j, i] = L[i, j]
     return inverse
+
+
+@compiled(VECTOR, INT)
+def ranked(values: Array, rank: int) -> float:
+    """Return the value (N,) that ``rank`` others do not exceed: Hoare's selection."""
+    left = values.copy()
+    low, high = 0, len(left) - 1
+    while low < high:
+        pivot, i, j = left[(low + high) // 2], low, high
+        while i <= j:
+            while left[i] < pivot:
+                i += 1
+            while left[j] > pivot:
+                j -= 1
+            if i <= j:
+                left[i], left[j] = left[j], left[i]
+                i, j = i + 1, j - 1
+        if rank <= j:
+            high = j
+        elif rank >= i:
+            low = i
+        else:
+            break
+    return left[rank]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from astratag.compiled import CUBE, FLAG_MATRIX, FLAGS, INT, LIGHT, MATRIX, REAL, VECTOR, compiled
 from astratag.edges import ALONG_SHARE, FEW_INTERVALS, POINTS_PER_EDGE, template_of
+from astratag.linear import ranked
 from astratag.warp import FittedWarp
 
 Array = NDArray[np.float64]
@@ -241,26 +242,28 @@ def _steepest_rise(slopes: Array, limit_px: Array) -> tuple[Array, Array, Array]
     return place, rise, beside
 
 
-@compiled(MATRIX)
-def _brightest_quarter(values: Array) -> float:
-    """Return what a quarter of values exceed."""
-    return np.partition(values.ravel(), 3 * values.size // 4)[3 * values.size // 4]
-
-
 @compiled(MATRIX, MATRIX, VECTOR)
 def _covered(ink: Array, paper: Array, reach_px: Array) -> Mask:
     """Return which points (E, M) have something else beside them than paper.
 
     It is darker than paper, but not because of a shadow: that would darken the ink as well.
     """
-    covered, apart = np.zeros(ink.shape, np.bool_), np.flatnonzero(reach_px >= APART_PX)
-    if len(apart) == 0:
+    edges, points = ink.shape
+    covered, bright, ratio, count = np.zeros(ink.shape, np.bool_), np.empty(ink.size), np.empty(ink.size), 0
+    for e in range(edges):
+        if reach_px[e] >= APART_PX:
+            for m in range(points):
+                bright[count], ratio[count] = paper[e, m], paper[e, m] / (ink[e, m] + DARKEST)
+                count += 1
+    if count == 0:
         return covered
-    bright = MOST_OF_COVER * _brightest_quarter(paper[apart])
-    clear = MOST_OF_COVER * _brightest_quarter((paper / (ink + DARKEST))[apart])
-    for e in apart:
-        for m in range(ink.shape[1]):
-            covered[e, m] = paper[e, m] < bright and paper[e, m] / (ink[e, m] + DARKEST) < clear
+    least_bright = MOST_OF_COVER * ranked(bright[:count], 3 * count // 4)  # what a quarter of all exceed
+    least_ratio = MOST_OF_COVER * ranked(ratio[:count], 3 * count // 4)
+    for e in range(edges):
+        if reach_px[e] >= APART_PX:
+            for m in range(points):
+                dark = paper[e, m] < least_bright
+                covered[e, m] = dark and paper[e, m] / (ink[e, m] + DARKEST) < least_ratio
     return covered
 
 

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astratag.camera import Camera, pixel
-from astratag.compiled import CUBE, MATRIX, VECTOR, compiled
+from astratag.compiled import CUBE, MATRIX, REAL, VECTOR, compiled
 from astratag.detection import LayerDetection, PlanarPose
 from astratag.geometry import LAYERS, square
-from astratag.linear import inverse_of
+from astratag.linear import dot, inverse_of
 from astratag.surface import Surface
 from astratag.transforms import perturbed, pose
 from astratag.warp import PoseWarp, on_surface, pose_jacobian, seen_from
@@ -193,31 +193,52 @@ def _normal_equations(
     return normal, right, squared
 
 
+@compiled(MATRIX, REAL)
+def _damped_inverse(normal: Array, damping: float) -> Array:
+    """Return the inverse (6, 6) of a normal matrix whose diagonal grows by a fraction.
+
+    Metres and radians differ by orders: it is inverted in pixels.
+    """
+    scale, damped = np.empty(6), np.empty((6, 6))
+    for p in range(6):
+        scale[p] = np.sqrt(normal[p, p]) + LEAST_SCALE
+    for p in range(6):
+        for q in range(6):
+            damped[p, q] = normal[p, q] / (scale[p] * scale[q]) + (damping if p == q else 0.0)
+    inverse = inverse_of(damped)
+    for p in range(6):
+        for q in range(6):
+            inverse[p, q] /= scale[p] * scale[q]
+    return inverse
+
+
 @compiled(MATRIX, MATRIX, MATRIX, VECTOR, VECTOR)
 def _adjusted(
     T_cam_marker: Array, points_marker: Array, seen_px: Array, sigma_px: Array, lens: Array
 ) -> tuple[Array, Array, float]:
     """Return the pose nearest to points (3, N) seen at (N, 2) within ``sigma_px`` (N,), its covariance, and RMS."""
-    T, damping = T_cam_marker.copy(), FIRST_DAMPING
+    T, damping, step = T_cam_marker.copy(), FIRST_DAMPING, np.empty(6)
     normal, right, squared = _normal_equations(T, points_marker, seen_px, sigma_px, lens)
     for _ in range(MAX_STEPS):
-        scale = np.sqrt(np.diag(normal)) + LEAST_SCALE  # metres and radians differ by orders: solve in pixels
-        damped = normal / np.outer(scale, scale) + damping * np.eye(6)
-        step = (inverse_of(damped) * (right / scale)).sum(axis=1) / scale
+        inverse = _damped_inverse(normal, damping)
+        for p in range(6):
+            step[p] = dot(inverse[p], right)
         moved = perturbed(T, step)
-        after = _normal_equations(moved, points_marker, seen_px, sigma_px, lens)
-        gain = squared - after[2]
+        next_normal, next_right, next_squared = _normal_equations(moved, points_marker, seen_px, sigma_px, lens)
+        gain = squared - next_squared
         if not gain > 0:
             damping *= 10
             if damping > MOST_DAMPING:
                 break
             continue
-        T, damping = moved, damping / 10
-        normal, right, squared = after
+        T, damping, normal, right, squared = moved, damping / 10, next_normal, next_right, next_squared
         if gain <= CONVERGED_PX2 * (1 + squared):
             break
-    misfit = max(1.0, squared / max(2 * len(seen_px) - 6, 1))
-    scale = np.sqrt(np.diag(normal)) + LEAST_SCALE
-    covariance = misfit * inverse_of(normal / np.outer(scale, scale) + UNSEEN * np.eye(6)) / np.outer(scale, scale)
-    off = seen_px - seen_from(points_marker, T, lens, 0.0)
-    return T, covariance, np.sqrt((off * off).sum() / len(seen_px))
+    covariance, misfit = _damped_inverse(normal, UNSEEN), max(1.0, squared / max(2 * len(seen_px) - 6, 1))
+    for p in range(6):
+        for q in range(6):
+            covariance[p, q] *= misfit
+    at, squared_px = seen_from(points_marker, T, lens, 0.0), 0.0
+    for i in range(len(seen_px)):
+        squared_px += (seen_px[i, 0] - at[i, 0]) ** 2 + (seen_px[i, 1] - at[i, 1]) ** 2
+    return T, covariance, np.sqrt(squared_px / len(seen_px))

@@ -338,11 +338,13 @@ def _pose_slopes(points_marker: Array, T_cam_marker: Array, lens: Array, along: 
 @compiled(MATRIX, MATRIX, VECTOR)
 def pose_jacobian(points_marker: Array, T_cam_marker: Array, lens: Array) -> Array:
     """Return the derivative (N, 2, 6) of the pixels of points (3, N) by a right perturbation of the pose."""
-    J = np.empty((points_marker.shape[1], 2, 6))
+    J, along = np.empty((points_marker.shape[1], 2, 6)), np.empty((2, points_marker.shape[1]))
     for axis in range(2):
-        along = np.zeros((2, points_marker.shape[1]))
-        along[axis] = 1.0
-        J[:, axis] = _pose_slopes(points_marker, T_cam_marker, lens, along).T
+        along[axis], along[1 - axis] = 1.0, 0.0
+        slopes = _pose_slopes(points_marker, T_cam_marker, lens, along)
+        for p in range(6):
+            for i in range(points_marker.shape[1]):
+                J[i, axis, p] = slopes[p, i]
     return J
 
 

@@ -5,10 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import astratag
 from astratag import compiled
-from astratag.linear import dot, inverse_of
+from astratag.linear import dot, inverse_of, ranked
 
 PACKAGE = Path(astratag.__file__).parent
 
@@ -27,6 +29,12 @@ def test_inverse_against_numpy():
         np.testing.assert_allclose(
             inverse_of(S), np.linalg.inv(S), rtol=1e-9, atol=1e-9 * np.abs(np.linalg.inv(S)).max()
         )
+
+
+@given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=50), st.data())
+def test_ranks_against_numpy(values, data):
+    rank = data.draw(st.integers(0, len(values) - 1))
+    assert ranked(np.array(values), rank) == np.sort(values)[rank]
 
 
 def test_what_has_no_inverse_is_answered_with_nan():
