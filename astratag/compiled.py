@@ -8,6 +8,7 @@ in C order; another one raises a TypeError.
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import product
 from typing import Any, TypeVar
 
 import numba
@@ -15,7 +16,7 @@ from numba import types
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-BOOL, INT, REAL = types.boolean, types.int64, types.float64
+BOOL, INT, REAL, SINGLE = types.boolean, types.int64, types.float64, types.float32
 
 
 def array(dtype: types.Type, dimensions: int) -> types.Type:
@@ -23,21 +24,28 @@ def array(dtype: types.Type, dimensions: int) -> types.Type:
     return types.Array(dtype, dimensions, "C", readonly=True)
 
 
-LIGHT, GRAY = array(types.float32, 2), array(types.uint8, 2)
+LIGHT, GRAY = array(SINGLE, 2), array(types.uint8, 2)
 """Images (H, W)."""
+BRIGHTNESS = (LIGHT, GRAY)
+"""Either image."""
+CHANNELS = array(SINGLE, 3)
+"""Images of several channels (H, W, C)."""
 VECTOR, MATRIX, CUBE = array(REAL, 1), array(REAL, 2), array(REAL, 3)
 FLAGS, FLAG_MATRIX = array(BOOL, 1), array(BOOL, 2)
 INDICES = array(INT, 1)
+PLACES = (MATRIX, array(SINGLE, 2))
+"""Points (N, 2), exact or to what a pixel needs."""
 
 
-def compiled(*arguments: types.Type) -> Callable[[F], F]:
-    """Return a decorator that compiles a function of arguments of these types.
+def compiled(*arguments: types.Type | tuple[types.Type, ...]) -> Callable[[F], F]:
+    """Return a decorator that compiles a function of arguments of these types; once for each where there are several.
 
     As NumPy does, division by zero gives infinities and NaNs.
     """
+    signatures = list(product(*(one if isinstance(one, tuple) else (one,) for one in arguments)))
 
     def decorate(function: F) -> F:
-        machine_code: Any = numba.njit(arguments, cache=True, error_model="numpy")(function)
+        machine_code: Any = numba.njit(signatures, cache=True, error_model="numpy")(function)
         return machine_code
 
     return decorate

@@ -1,0 +1,100 @@
+"""Normal equations: sums of products of columns, and what is solved or left out with them.  Compiled, and small."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astratag.compiled import INT, MATRIX, VECTOR, compiled
+
+Array = NDArray[np.float64]
+
+EXPLAINED = 1e-12
+"""What of a column's energy is left of it when all before it explain it."""
+
+
+@compiled(MATRIX)
+def gram(A: Array) -> Array:
+    """Return A.T A (P, P) of rows (N, P).  Zeros cost nothing."""
+    size = A.shape[1]
+    total = np.zeros((size, size))
+    for n in range(len(A)):
+        for i in range(size):
+            if A[n, i] != 0:
+                for j in range(i, size):
+                    total[i, j] += A[n, i] * A[n, j]
+    for i in range(size):
+        for j in range(i):
+            total[i, j] = total[j, i]
+    return total
+
+
+@compiled(MATRIX, VECTOR)
+def projected(A: Array, value: Array) -> Array:
+    """Return A.T value (P,) of rows (N, P)."""
+    total = np.zeros(A.shape[1])
+    for n in range(len(A)):
+        for i in range(A.shape[1]):
+            total[i] += A[n, i] * value[n]
+    return total
+
+
+@compiled(MATRIX, INT)
+def left_over(products: Array, count: int) -> Array:
+    """Return the products (P - C, P - C) of columns when what the first ``count`` C of them explain is taken out.
+
+    ``products`` (P, P) are those of all columns with each other.
+    """
+    size = len(products)
+    left = products.copy()
+    for k in range(count):
+        if left[k, k] > EXPLAINED * products[k, k]:
+            for i in range(k + 1, size):
+                share = left[i, k] / left[k, k]
+                for j in range(k + 1, size):
+                    left[i, j] -= share * left[k, j]
+    return left[count:, count:].copy()
+
+
+@compiled(MATRIX)
+def factored(normal: Array) -> Array:
+    """Return the lower Cholesky factor (P, P) of a positive matrix, NaNs of what is none."""
+    size = len(normal)
+    L = np.zeros((size, size))
+    for i in range(size):
+        for j in range(i + 1):
+            rest = normal[i, j]
+            for k in range(j):
+                rest -= L[i, k] * L[j, k]
+            L[i, j] = math.sqrt(rest) if i == j else rest / L[j, j]
+    return L
+
+
+@compiled(MATRIX, VECTOR)
+def solved(factor: Array, right: Array) -> Array:
+    """Return x (P,) of L L.T x = right (P,), for a lower factor (P, P)."""
+    size = len(right)
+    x = right.copy()
+    for i in range(size):
+        for k in range(i):
+            x[i] -= factor[i, k] * x[k]
+        x[i] /= factor[i, i]
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
+            x[i] -= factor[k, i] * x[k]
+        x[i] /= factor[i, i]
+    return x
+
+
+@compiled(MATRIX)
+def inverse(factor: Array) -> Array:
+    """Return the inverse (P, P) of L L.T, for a lower factor (P, P)."""
+    size = len(factor)
+    columns = np.empty((size, size))
+    for i in range(size):
+        unit = np.zeros(size)
+        unit[i] = 1.0
+        columns[i] = solved(factor, unit)
+    return columns
