@@ -33,8 +33,11 @@ CHANNELS = array(SINGLE, 3)
 VECTOR, MATRIX, CUBE = array(REAL, 1), array(REAL, 2), array(REAL, 3)
 FLAGS, FLAG_MATRIX = array(BOOL, 1), array(BOOL, 2)
 INDICES = array(INT, 1)
+BITS = array(types.uint8, 2)
 PLACES = (MATRIX, array(SINGLE, 2))
 """Points (N, 2), exact or to what a pixel needs."""
+PLACES_OF_MANY = (CUBE, array(SINGLE, 3))
+"""The same of Q patterns (Q, N, 2)."""
 
 
 def compiled(*arguments: types.Type | tuple[types.Type, ...]) -> Callable[[F], F]:
