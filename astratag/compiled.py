@@ -16,7 +16,8 @@ from numba import types
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-BOOL, INT, REAL, SINGLE = types.boolean, types.int64, types.float64, types.float32
+BOOL, INT, INDEX = types.boolean, types.int64, types.uint32
+REAL, SINGLE = types.float64, types.float32
 
 
 def array(dtype: types.Type, dimensions: int) -> types.Type:

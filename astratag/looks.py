@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.compiled import CHANNELS, CUBE, INT, LIGHT, MATRIX, REAL, SINGLE, compiled
+from astratag.compiled import CHANNELS, CUBE, INDEX, INT, LIGHT, MATRIX, REAL, SINGLE, compiled
 from astratag.geometry import TEMPLATE_UNITS
 
 Array = NDArray[np.float64]
@@ -22,6 +22,8 @@ sees that is beyond the print."""
 LOOKS = AROUND + 1
 OUTSIDE = 0.3
 """How far beyond the black square pictures of a print reach, as a fraction of its side."""
+HAIR = 1e-3
+"""What is beyond a picture lies so many texels before its last one, so that there is always a next."""
 LEAST_REST = 0.02
 """Fraction of the blur's variance that is always left to the nodes."""
 
@@ -44,19 +46,28 @@ def _factor(cxx: float, cxy: float, cyy: float, softness: float) -> tuple[float,
 
 
 @compiled(SINGLE, INT)
-def _texel(x: np.float32, size: int) -> tuple[int, np.float32]:
-    """Return the texel, of ``size``, that is before a place, and how far the place is from there to the next."""
+def _texel(x: np.float32, size: int) -> tuple[np.uint32, np.float32]:
+    """Return the texel, of ``size``, that is before a place, and how far the place is from there to the next.
+
+    Unsigned, so that it is not looked at for being negative.
+    """
+    last = np.float32(size - 1 - HAIR)
     x = x if x > 0 else np.float32(0)
-    before = min(int(x), size - 2)
-    return before, min(x - np.float32(before), np.float32(1))
+    x = x if x < last else last
+    before = np.int32(x)
+    return np.uint32(before), x - np.float32(before)
 
 
-@compiled(CHANNELS, INT, INT, SINGLE, SINGLE, INT)
-def _mixed(channels: Light, row: int, column: int, down: np.float32, right: np.float32, channel: int) -> np.float32:
+@compiled(CHANNELS, INDEX, INDEX, SINGLE, SINGLE, INT)
+def _mixed(
+    channels: Light, row: np.uint32, column: np.uint32, down: np.float32, right: np.float32, channel: int
+) -> np.float32:
     """Return one channel between a texel and the next ones."""
-    left, upper = channels[row, column, channel], channels[row, column + 1, channel]
-    left += down * (channels[row + 1, column, channel] - left)
-    return left + right * (upper + down * (channels[row + 1, column + 1, channel] - upper) - left)
+    next_row, next_column = np.uint32(row + np.uint32(1)), np.uint32(column + np.uint32(1))
+    left, upper = channels[row, column, channel], channels[row, next_column, channel]
+    left += down * (channels[next_row, column, channel] - left)
+    upper += down * (channels[next_row, next_column, channel] - upper)
+    return left + right * (upper - left)
 
 
 @compiled(CHANNELS, LIGHT, LIGHT, LIGHT)
@@ -78,8 +89,9 @@ def _sums(channels: Light, spreads: Light, nodes: Light, moments: Light) -> Ligh
             brightness[n] = _mixed(channels, row, column, down, right, 0)
             sums[6, n] += share * _mixed(channels, row, column, down, right, 1)
         for m in range(6):
+            to, moment = sums[m], moments[m, k]
             for n in range(count):
-                sums[m, n] += moments[m, k] * brightness[n]
+                to[n] += moment * brightness[n]
     return sums
 
 

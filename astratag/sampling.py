@@ -36,10 +36,12 @@ def between(image: Brightness, x: float, y: float) -> float:
     """
     height, width = image.shape
     x, y = _within(x, width - 1.0), _within(y, height - 1.0)
-    column, row = min(int(x), width - 2), min(int(y), height - 2)
-    right, down = x - column, y - row
-    left = image[row, column] * (1 - down) + image[row + 1, column] * down
-    return left * (1 - right) + (image[row, column + 1] * (1 - down) + image[row + 1, column + 1] * down) * right
+    left, top = int(x), int(y)
+    column, row = np.uint64(left), np.uint64(top)  # unsigned ones are not looked at for being negative
+    next_column, next_row = np.uint64(min(left + 1, width - 1)), np.uint64(min(top + 1, height - 1))
+    right, down = x - left, y - top
+    here = image[row, column] * (1 - down) + image[next_row, column] * down
+    return here * (1 - right) + (image[row, next_column] * (1 - down) + image[next_row, next_column] * down) * right
 
 
 @compiled(BRIGHTNESS, REAL, REAL)

@@ -258,8 +258,9 @@ def _best_codes(cells: Array, level: NDArray[np.int64], codes: Array) -> tuple[N
     for q in range(len(cells)):
         found = np.zeros(codes.shape[2])
         for c in range(CELLS):
+            cell, white = cells[q, c], codes[level[q], c]
             for k in range(len(found)):
-                found[k] += cells[q, c] * codes[level[q], c, k]
+                found[k] += cell * white[k]
         best[q] = found.argmax()
         correlation[q] = found[best[q]]
     return best, correlation

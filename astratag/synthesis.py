@@ -42,10 +42,11 @@ Seen = NDArray[np.bool_]
 Seeing = tuple[Seen, Array, Array, Array]
 W = TypeVar("W", bound=FittedWarp)
 
-BLACK, WHITE, BEYOND = CELLS, CELLS + 1, CELLS + 2
-"""Labels of what is always ink, always paper, and no longer the print; cells are labelled by their number."""
-LABELS = BEYOND + 1
-OF_COMMON = 3 + LABELS - CELLS
+BLACK, WHITE, BEYOND = range(3)
+"""Labels of what is always ink, always paper, and no longer the print; the cells' follow in their order."""
+FIRST_CELL = BEYOND + 1
+LABELS = FIRST_CELL + CELLS
+OF_COMMON = 3 + FIRST_CELL
 """What all identities have in common: light that varies in a plane, and the labels that are no cells."""
 KEPT_PICTURES = 64
 NODES, MANY_NODES = 24, 64
@@ -90,7 +91,7 @@ def _labels() -> NDArray[np.uint8]:
     for layer in LAYERS:
         fill(square(*(layer.frame or (-margin, TEMPLATE_UNITS + margin))), WHITE)
         fill(square(*layer.black), BLACK)
-        for label, cell in enumerate(cell_polygons() + DRAWN_OFFSET):
+        for label, cell in enumerate(cell_polygons() + DRAWN_OFFSET, start=FIRST_CELL):
             fill(layer_points(cell, layer), label)
     return picture
 
@@ -359,7 +360,8 @@ class Synthesis:
 def _picture(signature: bytes, softness: float) -> Picture:
     """Return the print of a signature (48 bytes) blurred by ``softness`` template units, 0 for not at all."""
     levels = np.zeros((2, 256), np.uint8)
-    levels[0, :LABELS] = 255 * np.append(np.frombuffer(signature, np.uint8), (0, 1, 0))
+    levels[0, WHITE] = 255
+    levels[0, FIRST_CELL:LABELS] = 255 * np.frombuffer(signature, np.uint8)
     levels[1, BEYOND] = 255
     size = max(round(len(_LABELS) * min(TEXELS / softness, 1.0)), 1) if softness else len(_LABELS)
     texel = len(_LABELS) / size
@@ -375,7 +377,7 @@ def _picture(signature: bytes, softness: float) -> Picture:
 
 @compiled(GRAY, MATRIX, CUBE, MATRIX)
 def _shares(labels: NDArray[np.uint8], template: Array, to_template: Array, nodes_px: Array) -> Array:
-    """Return the shares (N, 51) that labels have in what each of N points sees: what cells have in common first.
+    """Return the shares (N, 51) that labels have in what each of N points sees.
 
     ``nodes_px`` (K, 2) are pixels around a point.
     """
@@ -386,7 +388,7 @@ def _shares(labels: NDArray[np.uint8], template: Array, to_template: Array, node
             y = template[n, 1] + to_template[n, 1, 0] * nodes_px[k, 0] + to_template[n, 1, 1] * nodes_px[k, 1]
             column = min(max(int(x + OUTSIDE * TEMPLATE_UNITS), 0), labels.shape[1] - 1)
             row = min(max(int(y + OUTSIDE * TEMPLATE_UNITS), 0), labels.shape[0] - 1)
-            shares[n, (labels[row, column] + LABELS - CELLS) % LABELS] += share
+            shares[n, labels[row, column]] += share
     return shares
 
 
