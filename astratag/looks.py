@@ -58,7 +58,7 @@ def _texel(x: np.float32, size: int) -> tuple[np.uint32, np.float32]:
     return np.uint32(before), x - np.float32(before)
 
 
-@compiled(CHANNELS, INDEX, INDEX, SINGLE, SINGLE, INT)
+@compiled(CHANNELS, INDEX, INDEX, SINGLE, SINGLE, INT, any_order=True)
 def _mixed(
     channels: Light, row: np.uint32, column: np.uint32, down: np.float32, right: np.float32, channel: int
 ) -> np.float32:
@@ -70,7 +70,7 @@ def _mixed(
     return left + right * (upper - left)
 
 
-@compiled(CHANNELS, LIGHT, LIGHT, LIGHT)
+@compiled(CHANNELS, LIGHT, LIGHT, LIGHT, any_order=True)
 def _sums(channels: Light, spreads: Light, nodes: Light, moments: Light) -> Light:
     """Return six moments of the brightness at nodes (K, 2) around each of N points, and the mean beyond (7, N).
 

@@ -15,32 +15,24 @@ EXPLAINED = 1e-12
 """What of a column's energy is left of it when all before it explain it."""
 
 
+@compiled(VECTOR, VECTOR, any_order=True)
+def dot(a: Array, b: Array) -> float:
+    """Return the sum of the products of two columns (N,)."""
+    total = 0.0
+    for n in range(len(a)):
+        total += a[n] * b[n]
+    return total
+
+
 @compiled(MATRIX)
-def gram(A: Array) -> Array:
-    """Return A.T A (P, P) of rows (N, P).
-
-    Zeros cost nothing.  Both halves are summed up, because whole rows become vector instructions.
-    """
-    size = A.shape[1]
-    total = np.zeros((size, size))
-    for n in range(len(A)):
-        row = A[n]
-        for i in range(size):
-            if row[i] != 0:
-                value, to = row[i], total[i]
-                for j in range(size):
-                    to[j] += value * row[j]
-    return total
-
-
-@compiled(MATRIX, VECTOR)
-def projected(A: Array, value: Array) -> Array:
-    """Return A.T value (P,) of rows (N, P)."""
-    total = np.zeros(A.shape[1])
-    for n in range(len(A)):
-        for i in range(A.shape[1]):
-            total[i] += A[n, i] * value[n]
-    return total
+def gram(columns: Array) -> Array:
+    """Return the products (P, P) of columns (P, N) with each other."""
+    size = len(columns)
+    products = np.empty((size, size))
+    for i in range(size):
+        for j in range(i + 1):
+            products[i, j] = products[j, i] = dot(columns[i], columns[j])
+    return products
 
 
 @compiled(MATRIX, INT)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from astratag.compiled import CUBE, LIGHT, MATRIX, REAL, VECTOR, compiled
 from astratag.geometry import TEMPLATE_UNITS
 from astratag.looks import AROUND, BY_BLUR, BY_X, BY_Y, MEAN
-from astratag.normal import factored, gram, inverse, left_over, projected, solved
+from astratag.normal import dot, factored, gram, inverse, left_over, solved
 from astratag.sampling import between
 
 Array = NDArray[np.float64]
@@ -23,6 +23,8 @@ BLUR_STEP = 0.3
 """How far one step may take the logarithm of the blur, as a standard deviation."""
 STEP_PX = 1.0
 """How far one step may take a point of the print, as a standard deviation."""
+LEAST_REACH_PX = 1e-12
+"""By how much a parameter moves the print at least."""
 INTERPOLATED = 9 / 4
 """Variance of a pixel's noise over that of values interpolated between pixels."""
 LEAST_NOISE = 0.3
@@ -47,45 +49,41 @@ def contrast(template: Array, weight: Array, value: Array, looks: Array) -> tupl
     Of N points: template (N, 2), weight (N,), value (N,).  What a plane of light and what is beyond the print explain
     is taken out.
     """
-    columns = np.empty((len(value), OF_LEVEL + 2))
+    columns = np.empty((OF_LEVEL + 2, len(value)))
     for n in range(len(value)):
         root = math.sqrt(weight[n])
-        columns[n, 0] = root
-        columns[n, 1] = root * (template[n, 0] / TEMPLATE_UNITS - 0.5)
-        columns[n, 2] = root * (template[n, 1] / TEMPLATE_UNITS - 0.5)
-        columns[n, 3] = root * looks[AROUND, n]
-        columns[n, 4] = root * value[n]
-        columns[n, 5] = root * looks[MEAN, n]
+        columns[0, n] = root
+        columns[1, n] = root * (template[n, 0] / TEMPLATE_UNITS - 0.5)
+        columns[2, n] = root * (template[n, 1] / TEMPLATE_UNITS - 0.5)
+        columns[3, n] = root * looks[AROUND, n]
+        columns[4, n] = root * value[n]
+        columns[5, n] = root * looks[MEAN, n]
     left = left_over(gram(columns), OF_LEVEL)
     energy, common = left[1, 1] + 1e-12, left[0, 1]
     return common / energy, common / math.sqrt(energy * (left[0, 0] + 1e-12))
 
 
 @compiled(MATRIX, VECTOR, VECTOR, REAL)
-def least_squares(A: Array, value: Array, step_sigma: Array, pixels: float) -> tuple[Array, Array]:
-    """Return the unknowns (P,) of A x = value (N,), the first held by their step sigmas, and their covariance (P, P).
+def least_squares(columns: Array, value: Array, step_sigma: Array, pixels: float) -> tuple[Array, Array]:
+    """Return the unknowns (P,) that make columns (P, N) add up to values (N,), and their covariance (P, P).
 
-    ``A`` (N, P) and ``value`` stand for so many ``pixels``, which tell of the noise.
+    The first are held by their step sigmas.  The columns stand for so many ``pixels``, which tell of the noise.
     """
-    normal, right = gram(A), projected(A, value)
-    size = len(right)
-    scale = np.empty(size)
+    normal, size = gram(columns), len(columns)
+    right, scale = np.empty(size), np.empty(size)
     for i in range(size):
         scale[i] = math.sqrt(normal[i, i]) + 1e-12
+        right[i] = dot(columns[i], value) / scale[i]
     for i in range(size):
-        right[i] /= scale[i]
         for j in range(size):
             normal[i, j] /= scale[i] * scale[j]
         normal[i, i] += 1e-9
     factor = factored(normal)
     free = solved(factor, right) / scale
-    energy = 0.0
-    for n in range(len(value)):
-        residual = value[n]
-        for i in range(size):
-            residual -= A[n, i] * free[i]
-        energy += residual * residual
-    variance = INTERPOLATED * energy / max(pixels - size, 1.0) + LEAST_NOISE**2
+    residual = value.copy()
+    for i in range(size):
+        residual -= free[i] * columns[i]
+    variance = INTERPOLATED * dot(residual, residual) / max(pixels - size, 1.0) + LEAST_NOISE**2
     covariance = inverse(factor)
     for i in range(size):
         for j in range(size):
@@ -107,24 +105,23 @@ def step(
     value = values(light, at_px)
     apart, correlation = contrast(template, weight, value, looks)
     count, size = len(value), J.shape[2]
-    A = np.empty((count, size + 1 + OF_LIGHT))
-    reach = np.full(size, 1e-12)
-    for n in range(count):
-        root = math.sqrt(weight[n])
-        for p in range(size):
-            A[n, p] = -apart * root * (looks[BY_X, n] * J[n, 0, p] + looks[BY_Y, n] * J[n, 1, p])
-            reach[p] = max(reach[p], abs(J[n, 0, p]), abs(J[n, 1, p]))
-        A[n, size] = apart * root * looks[BY_BLUR, n]
-        u, v = template[n, 0] / TEMPLATE_UNITS - 0.5, template[n, 1] / TEMPLATE_UNITS - 0.5
-        for first, brightness in ((size + 1, root * looks[MEAN, n]), (size + 4, root)):
-            A[n, first], A[n, first + 1], A[n, first + 2] = brightness, brightness * u, brightness * v
-        A[n, size + 7] = root * looks[AROUND, n]
-        value[n] *= root
+    columns, root = np.empty((size + 1 + OF_LIGHT, count)), np.sqrt(weight)
     step_sigma = np.empty(size + 1)
     for p in range(size):
-        step_sigma[p] = min(STEP_PX / reach[p], warp_sigma[p])
+        reach_px = LEAST_REACH_PX
+        for n in range(count):
+            by_x, by_y = J[n, 0, p], J[n, 1, p]
+            columns[p, n] = -apart * root[n] * (looks[BY_X, n] * by_x + looks[BY_Y, n] * by_y)
+            reach_px = max(reach_px, abs(by_x), abs(by_y))
+        step_sigma[p] = min(STEP_PX / reach_px, warp_sigma[p])
     step_sigma[size] = BLUR_STEP
-    x, covariance = least_squares(A, value, step_sigma, weight.sum())
+    for n in range(count):
+        columns[size, n] = apart * root[n] * looks[BY_BLUR, n]
+        u, v = template[n, 0] / TEMPLATE_UNITS - 0.5, template[n, 1] / TEMPLATE_UNITS - 0.5
+        for first, brightness in ((size + 1, root[n] * looks[MEAN, n]), (size + 4, root[n])):
+            columns[first, n], columns[first + 1, n], columns[first + 2, n] = brightness, brightness * u, brightness * v
+        columns[size + OF_LIGHT, n] = root[n] * looks[AROUND, n]
+    x, covariance = least_squares(columns, root * value, step_sigma, weight.sum())
     moved_px = 0.0
     for n in range(count):
         for axis in range(2):

@@ -32,7 +32,7 @@ from astratag.geometry import (
     square,
 )
 from astratag.looks import AROUND, BY_BLUR, BY_X, BY_Y, MEAN, OUTSIDE, looks
-from astratag.normal import gram, left_over
+from astratag.normal import left_over
 from astratag.steps import contrast, step, values
 from astratag.warp import FittedWarp
 
@@ -279,6 +279,44 @@ class Alignment(Generic[W]):
         return SIGMA_FLOOR_PX * max(1.0, _widest_px(self.warp) / FINELY_SAMPLED_PX) ** COARSENESS
 
 
+@compiled(GRAY, MATRIX, CUBE, VECTOR, VECTOR, MATRIX)
+def _products(
+    labels: NDArray[np.uint8], template: Array, to_template: Array, weight: Array, value: Array, nodes_px: Array
+) -> Array:
+    """Return the products (55, 55), summed over N weighted points, of what their light is made of, and of that itself.
+
+    It is made of a plane over the print (3) and of the shares (51) that labels have in what a point sees, at
+    ``nodes_px`` (K, 2) around it; each point sees but a few.
+    """
+    last = 3 + LABELS
+    products, column = np.zeros((last + 1, last + 1)), np.zeros(last + 1)
+    share = 1 / len(nodes_px)
+    which = np.zeros(4 + len(nodes_px), dtype=np.int64)
+    which[:4] = 0, 1, 2, last
+    for n in range(len(template)):
+        u, v = template[n, 0], template[n, 1]
+        column[0], column[1], column[2] = 1.0, u / TEMPLATE_UNITS - 0.5, v / TEMPLATE_UNITS - 0.5
+        column[last] = value[n]
+        count = 4
+        for k in range(len(nodes_px)):
+            x = u + to_template[n, 0, 0] * nodes_px[k, 0] + to_template[n, 0, 1] * nodes_px[k, 1]
+            y = v + to_template[n, 1, 0] * nodes_px[k, 0] + to_template[n, 1, 1] * nodes_px[k, 1]
+            at_column = min(max(int(x + OUTSIDE * TEMPLATE_UNITS), 0), labels.shape[1] - 1)
+            at_row = min(max(int(y + OUTSIDE * TEMPLATE_UNITS), 0), labels.shape[0] - 1)
+            label = 3 + labels[at_row, at_column]
+            if column[label] == 0:
+                which[count] = label
+                count += 1
+            column[label] += share
+        for i in which[:count]:
+            weighted = weight[n] * column[i]
+            for j in which[:count]:
+                products[i, j] += weighted * column[j]
+        for i in which[:count]:
+            column[i] = 0.0
+    return products
+
+
 class Synthesis:
     """The prints of a dictionary, ready to be compared with images pixel by pixel."""
 
@@ -295,9 +333,9 @@ class Synthesis:
         seen = look(warp, light.shape)
         if seen is None:
             return np.zeros((len(self._codes) // 4, 4))
-        shares = _shares(_LABELS, seen.template, seen.to_template, blur_px * _MANY_NODES)
-        columns = _weighted(seen.template, seen.weight, shares, values(light, seen.at_px))
-        left = left_over(gram(columns), OF_COMMON)
+        value = values(light, seen.at_px)
+        products = _products(_LABELS, seen.template, seen.to_template, seen.weight, value, blur_px * _MANY_NODES)
+        left = left_over(products, OF_COMMON)
         among, common, energy = left[:CELLS, :CELLS], left[:CELLS, CELLS], left[CELLS, CELLS]
         length = np.sqrt(((self._codes @ among) * self._codes).sum(axis=1) * energy)
         return (self._codes @ common / np.maximum(length, 1e-9)).reshape(-1, 4)
@@ -373,35 +411,3 @@ def _picture(signature: bytes, softness: float) -> Picture:
             cv2.GaussianBlur(small, (0, 0), deviation, borderType=cv2.BORDER_REPLICATE) if softness else small
         )
     return Picture(cv2.merge(channels), softness, texel)
-
-
-@compiled(GRAY, MATRIX, CUBE, MATRIX)
-def _shares(labels: NDArray[np.uint8], template: Array, to_template: Array, nodes_px: Array) -> Array:
-    """Return the shares (N, 51) that labels have in what each of N points sees.
-
-    ``nodes_px`` (K, 2) are pixels around a point.
-    """
-    shares, share = np.zeros((len(template), LABELS)), 1 / len(nodes_px)
-    for n in range(len(template)):
-        for k in range(len(nodes_px)):
-            x = template[n, 0] + to_template[n, 0, 0] * nodes_px[k, 0] + to_template[n, 0, 1] * nodes_px[k, 1]
-            y = template[n, 1] + to_template[n, 1, 0] * nodes_px[k, 0] + to_template[n, 1, 1] * nodes_px[k, 1]
-            column = min(max(int(x + OUTSIDE * TEMPLATE_UNITS), 0), labels.shape[1] - 1)
-            row = min(max(int(y + OUTSIDE * TEMPLATE_UNITS), 0), labels.shape[0] - 1)
-            shares[n, labels[row, column]] += share
-    return shares
-
-
-@compiled(MATRIX, VECTOR, MATRIX, VECTOR)
-def _weighted(template: Array, weight: Array, shares: Array, value: Array) -> Array:
-    """Return N points' weighted columns (N, 55): what light that varies in a plane is made of, shares, and values."""
-    columns = np.empty((len(weight), 3 + LABELS + 1))
-    for n in range(len(weight)):
-        root = math.sqrt(weight[n])
-        columns[n, 0] = root
-        columns[n, 1] = root * (template[n, 0] / TEMPLATE_UNITS - 0.5)
-        columns[n, 2] = root * (template[n, 1] / TEMPLATE_UNITS - 0.5)
-        for label in range(LABELS):
-            columns[n, 3 + label] = root * shares[n, label]
-        columns[n, 3 + LABELS] = root * value[n]
-    return columns
