@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from typing import TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from astratag.compiled import CUBE, GRAY, MATRIX, REAL, VECTOR, compiled
 from astratag.geometry import TEMPLATE_UNITS, square
-from astratag.signature import sample
+from astratag.normal import dot, factored, gram, solved
+from astratag.sampling import between
 from astratag.warp import FittedWarp
 
 Array = NDArray[np.float64]
@@ -21,7 +24,8 @@ COARSE_BLUR, COARSE_STEPS = 0.03, 4
 FINE_STEPS = 3
 LEAST_BLUR_PX = 0.5
 TUKEY = 4.685
-_CROSS = np.array([(0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])[:, None, :]
+FIRST_SIGMA = 10.0
+"""Grey values by which the image may differ from what is expected before any step."""
 
 
 def align(gray: Image, warp: W, points: Array, expected: Array, *, blur: float, steps: int) -> W:
@@ -32,7 +36,7 @@ def align(gray: Image, warp: W, points: Array, expected: Array, *, blur: float, 
     (Baker and Matthews, "Lucas-Kanade 20 years on", IJCV 2004).
     """
     u, v = (points / (TEMPLATE_UNITS / 2) - 1.0).T
-    light = np.stack([u**0, u, v, u * v, u * u, v * v, expected, expected * u, expected * v], axis=1)
+    light = np.stack([u**0, u, v, u * v, u * u, v * v, expected, expected * u, expected * v])
     outline = warp(square(0.0, TEMPLATE_UNITS))
     low, high = outline.min(axis=0), outline.max(axis=0)
     span_px = float((high - low).max())
@@ -42,35 +46,77 @@ def align(gray: Image, warp: W, points: Array, expected: Array, *, blur: float, 
         return warp
     corner = np.clip(np.floor(low - 0.2 * span_px), 0, gray.shape[::-1]).astype(int)
     end = np.clip(np.ceil(high + 0.2 * span_px) + 1, 0, gray.shape[::-1]).astype(int)
-    part = gray[corner[1] : end[1], corner[0] : end[0]]
+    part = np.ascontiguousarray(gray[corner[1] : end[1], corner[0] : end[0]])
     if min(part.shape) < 8:
         return warp
     width = 2 * round(np.sqrt(3.0) * blur * side_px) + 1  # of a box as wide as a Gaussian of that deviation
     smooth = cv2.blur(part, (width, width)) if blur * side_px > LEAST_BLUR_PX else part
     for _ in range(steps):
-        at = warp(points) - corner
-        inside = ((at >= 1) & (at <= np.array(smooth.shape[::-1]) - 2)).all(axis=1)
-        if inside.sum() < len(points) / 2:
+        J = np.ascontiguousarray(warp.jacobian(points))
+        columns, value = _columns(smooth, np.ascontiguousarray(warp(points) - corner), J, light)
+        if len(value) < len(points) / 2:
             return warp
-        value, right, left, below, above = sample(smooth, at[None, inside] + _CROSS)
-        slope = np.stack([(right - left) / 2, (below - above) / 2], axis=1)
-        by_warp = (slope[:, None, :] @ warp.jacobian(points[inside]))[:, 0]
-        warp = warp.stepped(_solve(np.column_stack([-by_warp, light[inside]]), value, warp.step_sigma()))
+        warp = warp.stepped(_solve(columns, value, warp.step_sigma()))
     return warp
 
 
-def _solve(A: Array, value: Array, step_sigma: Array) -> Array:
-    """Return the step (P,) of the first P unknowns of A x = value, twice reweighted against outliers."""
-    scale = np.linalg.norm(A, axis=0) + 1e-12
-    A = A / scale
-    weight = np.ones(len(value))
-    sigma = 10.0
+def _solve(columns: Array, value: Array, step_sigma: Array) -> Array:
+    """Return the step (P,) that is the first unknowns of columns (P + 9, N), twice reweighted against outliers."""
+    weight, sigma = np.ones(len(value)), FIRST_SIGMA
     for _ in range(2):
-        weighted = A * weight[:, None]
-        prior = np.full(A.shape[1], 1e-9)
-        prior[: len(step_sigma)] += (sigma / (step_sigma * scale[: len(step_sigma)])) ** 2
-        x = np.linalg.solve(weighted.T @ A + np.diag(prior), weighted.T @ value)
-        residual = value - A @ x
+        x, residual = _solution(columns, value, weight, step_sigma, sigma)
         sigma = 1.4826 * float(np.median(np.abs(residual))) + 1e-3
         weight = np.clip(1 - (residual / (TUKEY * sigma)) ** 2, 0, None) ** 2
-    return (x / scale)[: len(step_sigma)]
+    return x[: len(step_sigma)]
+
+
+@compiled(GRAY, MATRIX, CUBE, MATRIX)
+def _columns(image: Image, at_px: Array, J: Array, light: Array) -> tuple[Array, Array]:
+    """Return columns (P + 9, M) that add up to the values (M,) of an image at those pixels (N, 2) that are inside it.
+
+    They are what the values change by as the warp's parameters do, ``J`` (N, 2, P), and what ``light`` (9, N) does.
+    """
+    height, width = image.shape
+    size = J.shape[2]
+    inside = np.empty(len(at_px), dtype=np.int64)
+    count = 0
+    for n in range(len(at_px)):
+        if 1 <= at_px[n, 0] <= width - 2 and 1 <= at_px[n, 1] <= height - 2:
+            inside[count] = n
+            count += 1
+    columns, value = np.empty((size + len(light), count)), np.empty(count)
+    for m in range(count):
+        n = inside[m]
+        x, y = at_px[n, 0], at_px[n, 1]
+        value[m] = between(image, x, y)
+        by_x = (between(image, x + 1, y) - between(image, x - 1, y)) / 2
+        by_y = (between(image, x, y + 1) - between(image, x, y - 1)) / 2
+        for p in range(size):
+            columns[p, m] = -(by_x * J[n, 0, p] + by_y * J[n, 1, p])
+        for i in range(len(light)):
+            columns[size + i, m] = light[i, n]
+    return columns, value
+
+
+@compiled(MATRIX, VECTOR, VECTOR, VECTOR, REAL)
+def _solution(columns: Array, value: Array, weight: Array, step_sigma: Array, sigma: float) -> tuple[Array, Array]:
+    """Return the unknowns (P,) with which weighted columns (P, N) add up to values (N,), and what is left (N,).
+
+    The first are held by their step sigmas, against values' ``sigma``.
+    """
+    size = len(columns)
+    normal, right, scale = gram(columns * np.sqrt(weight)), np.empty(size), np.empty(size)
+    for i in range(size):
+        scale[i] = math.sqrt(dot(columns[i], columns[i])) + 1e-12
+        right[i] = dot(columns[i], weight * value) / scale[i]
+    for i in range(size):
+        for j in range(size):
+            normal[i, j] /= scale[i] * scale[j]
+        normal[i, i] += 1e-9
+    for i in range(len(step_sigma)):
+        normal[i, i] += (sigma / (step_sigma[i] * scale[i])) ** 2
+    x = solved(factored(normal), right) / scale
+    residual = value.copy()
+    for i in range(size):
+        residual -= x[i] * columns[i]
+    return x, residual

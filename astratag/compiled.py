@@ -16,6 +16,7 @@ import re
 import shutil
 from collections.abc import Callable
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,10 +25,12 @@ from numba import types
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-BOOL, INT, REAL = types.boolean, types.int64, types.float64
+BOOL, INT, INDEX = types.boolean, types.int64, types.uint32
+REAL, SINGLE = types.float64, types.float32
 
 PREFIX = "compiled-"
-SUMS_IN_ANY_ORDER = {"reassoc", "contract"}
+ANY_ORDER = {"reassoc", "nsz", "contract"}
+"""What the compiler may do to sums that may be added up in any order: it keeps several at once, in one register."""
 
 
 def array(dtype: types.Type, dimensions: int) -> types.Type:
@@ -35,28 +38,36 @@ def array(dtype: types.Type, dimensions: int) -> types.Type:
     return types.Array(dtype, dimensions, "C", readonly=True)
 
 
-LIGHT, GRAY = array(types.float32, 2), array(types.uint8, 2)
+LIGHT, GRAY = array(SINGLE, 2), array(types.uint8, 2)
 """Images (H, W)."""
+BRIGHTNESS = (LIGHT, GRAY)
+"""Either image."""
+CHANNELS = array(SINGLE, 3)
+"""Images of several channels (H, W, C)."""
 VECTOR, MATRIX, CUBE = array(REAL, 1), array(REAL, 2), array(REAL, 3)
 FLAGS, FLAG_MATRIX = array(BOOL, 1), array(BOOL, 2)
 INDICES = array(INT, 1)
+BITS = array(types.uint8, 2)
 """All in C order, and only read."""
+PLACES = (MATRIX, array(SINGLE, 2))
+"""Points (N, 2), exact or to what a pixel needs."""
+PLACES_OF_MANY = (CUBE, array(SINGLE, 3))
+"""The same of Q patterns (Q, N, 2)."""
 
 
-def compiled(*arguments: types.Type) -> Callable[[F], F]:
-    """Return a decorator that compiles a function of arguments of these types.
+def compiled(*arguments: types.Type | tuple[types.Type, ...]) -> Callable[[F], F]:
+    """Return a decorator that compiles a function of arguments of these types; once for each where there are several.
 
-    As in NumPy, division by zero gives infinities and NaNs, and sums are taken in any order.
+    As in NumPy, division by zero gives infinities and NaNs, and sums are added up in any order.
     """
+    signatures = list(product(*(one if isinstance(one, tuple) else (one,) for one in arguments)))
 
     def decorate(function: F) -> F:
         config: Any = numba.config
         others = config.CACHE_DIR
         try:
             config.CACHE_DIR = str(_folder())
-            machine_code: Any = numba.njit(arguments, cache=True, error_model="numpy", fastmath=SUMS_IN_ANY_ORDER)(
-                function
-            )
+            machine_code: Any = numba.njit(signatures, cache=True, error_model="numpy", fastmath=ANY_ORDER)(function)
         finally:
             config.CACHE_DIR = others
         return machine_code

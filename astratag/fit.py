@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from astratag.compiled import FLAG_MATRIX, FLAGS, INDICES, INT, MATRIX, REAL, VECTOR, compiled
 from astratag.edges import POINTS_PER_EDGE, template_of
-from astratag.linear import dot, inverse_of, ranked
 from astratag.locate import SMOOTHING_PX, EdgePoints, locate
 from astratag.neighbours import Crossings, narrowing, pull
+from astratag.normal import dot, factored, inverse, ranked
 from astratag.warp import FittedWarp
 
 Array = NDArray[np.float64]
@@ -409,7 +409,7 @@ def _robust_least_squares(
             for q in range(p + 1):
                 covariance[p, q] = covariance[q, p] = dot(weighted, A[q])
             covariance[p, p] += prior[p]
-        covariance = inverse_of(covariance)
+        covariance = inverse(factored(covariance))
         residual[:] = offset
         for p in range(size):
             x[p] = dot(covariance[p], right)

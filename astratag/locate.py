@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from astratag.compiled import CUBE, FLAG_MATRIX, FLAGS, INT, LIGHT, MATRIX, REAL, VECTOR, compiled
 from astratag.edges import ALONG_SHARE, FEW_INTERVALS, POINTS_PER_EDGE, template_of
-from astratag.linear import ranked
+from astratag.normal import ranked
+from astratag.sampling import between
 from astratag.warp import FittedWarp
 
 Array = NDArray[np.float64]
@@ -181,17 +182,6 @@ def _in_view(predicted_px: Array, facing: Mask, profile_px: float, height: int, 
     return in_view
 
 
-@compiled(LIGHT, REAL, REAL)
-def interpolated(light: NDArray[np.float32], x: float, y: float) -> float:
-    """Return the light between four pixels; ``x`` and ``y`` are within the image."""
-    height, width = light.shape
-    column, row = min(int(x), width - 2), min(int(y), height - 2)
-    x, y = x - column, y - row
-    above = light[row, column] + x * (light[row, column + 1] - light[row, column])
-    below = light[row + 1, column] + x * (light[row + 1, column + 1] - light[row + 1, column])
-    return above + y * (below - above)
-
-
 @compiled(LIGHT, CUBE, CUBE, INT)
 def _profiles(light: NDArray[np.float32], predicted_px: Array, normal: Array, half: int) -> tuple[Array, Array, Array]:
     """Return the light (E, M, 2 half + 1) every ``STEP_PX`` across edges, and the least and the most of each (E, M).
@@ -199,7 +189,6 @@ def _profiles(light: NDArray[np.float32], predicted_px: Array, normal: Array, ha
     Continued beyond the image as at its border; zeros where a warp gone astray predicts no place at all.
     """
     _, edges, points = predicted_px.shape
-    bottom, right = light.shape[0] - 1.0, light.shape[1] - 1.0
     profiles = np.zeros((edges, points, 2 * half + 1))
     ink, paper = np.zeros((edges, points)), np.zeros((edges, points))
     for e in range(edges):
@@ -209,9 +198,7 @@ def _profiles(light: NDArray[np.float32], predicted_px: Array, normal: Array, ha
                 step_x, step_y = STEP_PX * normal[0, e, m], STEP_PX * normal[1, e, m]
                 least, most = np.inf, -np.inf
                 for k in range(2 * half + 1):
-                    at_x = min(max(x + (k - half) * step_x, 0.0), right)
-                    at_y = min(max(y + (k - half) * step_y, 0.0), bottom)
-                    value = interpolated(light, at_x, at_y)
+                    value = between(light, x + (k - half) * step_x, y + (k - half) * step_y)
                     profiles[e, m, k] = value
                     least, most = min(least, value), max(most, value)
                 ink[e, m], paper[e, m] = least, most

@@ -14,7 +14,7 @@ from astratag.camera import Camera, pixel
 from astratag.compiled import CUBE, MATRIX, REAL, VECTOR, compiled
 from astratag.detection import LayerDetection, PlanarPose
 from astratag.geometry import LAYERS, square
-from astratag.linear import dot, inverse_of
+from astratag.normal import dot, factored, inverse
 from astratag.surface import Surface
 from astratag.transforms import perturbed, pose
 from astratag.warp import PoseWarp, on_surface, pose_jacobian, seen_from
@@ -205,11 +205,11 @@ def _damped_inverse(normal: Array, damping: float) -> Array:
     for p in range(6):
         for q in range(6):
             damped[p, q] = normal[p, q] / (scale[p] * scale[q]) + (damping if p == q else 0.0)
-    inverse = inverse_of(damped)
+    undamped = inverse(factored(damped))
     for p in range(6):
         for q in range(6):
-            inverse[p, q] /= scale[p] * scale[q]
-    return inverse
+            undamped[p, q] /= scale[p] * scale[q]
+    return undamped
 
 
 @compiled(MATRIX, MATRIX, MATRIX, VECTOR, VECTOR)
@@ -220,9 +220,9 @@ def _adjusted(
     T, damping, step = T_cam_marker.copy(), FIRST_DAMPING, np.empty(6)
     normal, right, squared = _normal_equations(T, points_marker, seen_px, sigma_px, lens)
     for _ in range(MAX_STEPS):
-        inverse = _damped_inverse(normal, damping)
+        by_right = _damped_inverse(normal, damping)
         for p in range(6):
-            step[p] = dot(inverse[p], right)
+            step[p] = dot(by_right[p], right)
         moved = perturbed(T, step)
         next_normal, next_right, next_squared = _normal_equations(moved, points_marker, seen_px, sigma_px, lens)
         gain = squared - next_squared

@@ -8,11 +8,15 @@ as a ratio to its own ink (that is the same in shadow and out of it), whichever 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
+from astratag.compiled import INDICES, LIGHT, PLACES_OF_MANY, REAL, VECTOR, compiled
 from astratag.geometry import CELLS, TEMPLATE_UNITS
-from astratag.signature import ALWAYS_BLACK, CELL_SAMPLES, Warp, sample
+from astratag.sampling import Places, bilinear
+from astratag.signature import ALWAYS_BLACK, CELL_SAMPLES, SAMPLES_A_CELL, Warp
 
 Array = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -45,7 +49,8 @@ def _square_points(near: float, far: float, low: float, high: float, count: int)
 
 def _nearest(points: Array, among: Array, count: int) -> NDArray[np.int64]:
     """Return which ``count`` of the points ``among`` (A, 2) are nearest to each of ``points`` (N, 2)."""
-    return np.argsort(((points[:, None] - among) ** 2).sum(axis=2), axis=1, kind="stable")[:, :count]
+    apart = ((points[:, None] - among) ** 2).sum(axis=2)
+    return np.ascontiguousarray(np.argsort(apart, axis=1, kind="stable")[:, :count])
 
 
 _CENTRES = CELL_SAMPLES.mean(axis=1)
@@ -58,42 +63,84 @@ _MARGIN = _square_points(
 """White around every layer: on the quiet margin, or in the middle of a frame."""
 RELIT_SAMPLES = np.concatenate([CELL_SAMPLES.reshape(-1, 2), _INK, _MARGIN])
 """Where a pattern is sampled (S, 2) to be relit, template units."""
-_PARTS = np.cumsum([CELL_SAMPLES.shape[0] * CELL_SAMPLES.shape[1], len(_INK)])
+_INK_FROM = CELLS * SAMPLES_A_CELL
+_MARGIN_FROM = _INK_FROM + len(_INK)
 _INK_OF_CELL, _INK_OF_MARGIN = _nearest(_CENTRES, _INK, INK_POINTS), _nearest(_MARGIN, _INK, PAIR_POINTS)
 _MARGIN_OF_CELL = _nearest(_CENTRES, _MARGIN, PAIR_POINTS)
 _PAPER_OF_CELL = _nearest(_CENTRES, np.concatenate([_CENTRES, _MARGIN]), PAPER_POINTS)
 
 
-def relit_cells(light: Light, samples_px: Array | NDArray[np.float32]) -> tuple[Array, Seen]:
+@compiled(VECTOR, INDICES)
+def _ordered(values: Array, which: NDArray[np.int64]) -> Array:
+    """Return those of values (N,) that ``which`` (K,) says, in rising order."""
+    ordered = np.empty(len(which))
+    for k in range(len(which)):
+        value = values[which[k]]
+        place = k
+        while place > 0 and ordered[place - 1] > value:
+            ordered[place] = ordered[place - 1]
+            place -= 1
+        ordered[place] = value
+    return ordered
+
+
+@compiled(REAL)
+def _grey(logarithm: float) -> float:
+    """Return about which grey value a logarithm of light has."""
+    return FULL * (math.exp(logarithm) / FULL) ** CODE_EXPONENT
+
+
+@compiled(VECTOR, VECTOR, VECTOR)
+def _relit(samples: Array, ink: Array, margin: Array) -> tuple[Array, Seen]:
+    """Return one pattern's cells (48,), and which are seen, from logarithms of light at its samples."""
+    levels, ratios = np.empty(CELLS + len(margin)), np.empty(CELLS + len(margin))
+    ink_of_cell, beside_margin = np.empty(CELLS), np.empty(len(margin))
+    for c in range(CELLS):
+        ink_of_cell[c] = _ordered(ink, _INK_OF_CELL[c])[INK_POINTS // 2]
+        levels[c] = samples[c * SAMPLES_A_CELL : (c + 1) * SAMPLES_A_CELL].mean()
+        ratios[c] = levels[c] - ink_of_cell[c]
+    for m in range(len(margin)):
+        ink_of_margin = _ordered(ink, _INK_OF_MARGIN[m])[PAIR_POINTS // 2]
+        levels[CELLS + m], ratios[CELLS + m] = margin[m], margin[m] - ink_of_margin
+        beside_margin[m] = _grey(margin[m]) - _grey(ink_of_margin)
+    contrast, clear, visible = np.empty(CELLS), np.empty(CELLS), np.empty(CELLS)
+    for c in range(CELLS):
+        by_ratio = _ordered(ratios, _PAPER_OF_CELL[c])[-BRIGHTEST]
+        contrast[c] = min(by_ratio, _ordered(levels, _PAPER_OF_CELL[c])[-BRIGHTEST] - ink_of_cell[c])
+        clear[c] = _grey(ink_of_cell[c] + contrast[c]) - _grey(ink_of_cell[c])
+        visible[c] = min(clear[c], _ordered(beside_margin, _MARGIN_OF_CELL[c])[PAIR_POINTS // 2])
+    ordered, place = _ordered(clear, np.arange(CELLS)), MOST_CELLS * (CELLS - 1)
+    below = int(place)
+    exceeded = ordered[below] + (place - below) * (ordered[below + 1] - ordered[below])
+    least = max(LEAST_CONTRAST * exceeded, LEAST_CONTRAST_GREY)
+    cells, seen = np.zeros(CELLS), visible >= least
+    for c in range(CELLS):
+        if seen[c]:
+            cells[c] = min(max(ratios[c] / contrast[c], 0.0), 1.0)
+    return cells, seen
+
+
+@compiled(LIGHT, PLACES_OF_MANY)
+def _relit_cells(light: Light, samples_px: NDArray) -> tuple[Array, Seen]:
+    cells, seen = np.empty((len(samples_px), CELLS)), np.empty((len(samples_px), CELLS), dtype=np.bool_)
+    logarithm = np.empty(samples_px.shape[1])
+    for q in range(len(samples_px)):
+        for s in range(len(logarithm)):
+            logarithm[s] = math.log(bilinear(light, samples_px[q, s, 0], samples_px[q, s, 1]) + DARKEST)
+        cells[q], seen[q] = _relit(logarithm[:_INK_FROM], logarithm[_INK_FROM:_MARGIN_FROM], logarithm[_MARGIN_FROM:])
+    return cells, seen
+
+
+def relit_cells(light: Light, samples_px: Places) -> tuple[Array, Seen]:
     """Return cells (Q, 48) of patterns sampled at ``RELIT_SAMPLES`` (Q, S, 2), 0 ink to 1 paper, and which are seen.
 
     ``light`` (H, W) is the image in linear light, 0..255.  A cell is hidden where its own ink and paper look alike,
     as saturated ones do, or where the margin nearest to it looks like the border inside it: something lies on both.
     """
-    samples, ink, margin = np.split(np.log(sample(light, samples_px) + DARKEST), _PARTS, axis=1)
-    cells = samples.reshape(len(samples), CELLS, -1).mean(axis=2)
-    ink_of_cell, ink_of_margin = np.median(ink[:, _INK_OF_CELL], axis=2), np.median(ink[:, _INK_OF_MARGIN], axis=2)
-    levels = np.concatenate([cells, margin], axis=1)
-    ratios = np.concatenate([cells - ink_of_cell, margin - ink_of_margin], axis=1)
-    contrast = np.minimum(_paper(ratios), _paper(levels) - ink_of_cell)
-    clear = _grey(ink_of_cell + contrast) - _grey(ink_of_cell)
-    beside = np.median((_grey(margin) - _grey(ink_of_margin))[:, _MARGIN_OF_CELL], axis=2)
-    least = LEAST_CONTRAST * np.quantile(clear, MOST_CELLS, axis=1, keepdims=True)
-    seen = np.minimum(clear, beside) >= np.maximum(least, LEAST_CONTRAST_GREY)
-    return np.where(seen, np.clip((cells - ink_of_cell) / np.where(seen, contrast, 1.0), 0.0, 1.0), 0.0), seen
+    return _relit_cells(light, np.ascontiguousarray(samples_px))
 
 
 def relit_layer(light: Light, warp: Warp, samples: Array) -> tuple[Array, Seen]:
     """Return the relit cells (48,) seen through a warp at a layer's own ``samples``, and which of them are seen."""
     cells, seen = relit_cells(light, warp(samples)[None])
     return cells[0], seen[0]
-
-
-def _paper(brightness: Array) -> Array:
-    """Return the second largest (Q, 48) of what is around each cell, of cells and margin (Q, 48 + M)."""
-    return np.partition(brightness[:, _PAPER_OF_CELL], -BRIGHTEST, axis=2)[..., -BRIGHTEST]
-
-
-def _grey(logarithm: Array) -> Array:
-    """Return about which grey value a logarithm of light has."""
-    return FULL * (np.exp(logarithm) / FULL) ** CODE_EXPONENT

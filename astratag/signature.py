@@ -7,16 +7,28 @@ removed, and what is left is correlated with every code in every orientation: so
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from astratag.codes import Reading, acceptance_threshold
 from astratag.codes.acceptance import FALSE_ACCEPT_RATE
 from astratag.codes.soft import correlations
+from astratag.compiled import (
+    BITS,
+    BRIGHTNESS,
+    CUBE,
+    FLAG_MATRIX,
+    GRAY,
+    INDICES,
+    MATRIX,
+    PLACES_OF_MANY,
+    compiled,
+)
 from astratag.dictionary import Dictionary
 from astratag.geometry import (
     CELLS,
@@ -28,11 +40,10 @@ from astratag.geometry import (
     layer_points,
     square,
 )
+from astratag.sampling import Brightness, Places, between, bilinear, sample
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
-Brightness = NDArray[np.uint8] | NDArray[np.float32]
-"""An image (H, W): gray values as they are, or linear light."""
 Warp = Callable[[Array], Array]
 """Takes template points (..., 2) to pixels (..., 2)."""
 
@@ -42,6 +53,8 @@ LIKELY_RATE = 0.001
 """The share whose reading through the edges of one layer may be worth fitting all the others."""
 EFFECTIVE_SHARE = 45 / CELLS
 """How many independent cells one counts for: by ``effective_cells``, of squares of any size in 130 000 photographs'."""
+LEAST_POINTS = 16
+"""With fewer points of a print in the image nothing is said of its looks."""
 LEAST_SEEN = CELLS // 2
 """With fewer cells seen chance fits better than it should: what hides the others has a shape too."""
 
@@ -80,12 +93,16 @@ for _samples in _LAYER_SAMPLES:
     _samples.flags.writeable = False  # so that warps may keep where they are on a surface
 BLUR_UNITS = (0.0, 60.0, 120.0)
 """Widths of box blurs, template units, at which codes are known: what small squares look like."""
+_HALF_WAY = (np.array(BLUR_UNITS[:-1]) + BLUR_UNITS[1:]) / 2
 BLURRED_CELLS = (CELLS, 25, 21)
 """How many cells a correlation with such codes is worth, measured likewise: blur makes them alike."""
 PIXEL_BLUR = 2.8
 """Width in pixels of the box blur that is like a lens's and a pixel's together (sigma 0.8)."""
-_ILLUMINATION = _smooth(CELL_SAMPLES.mean(axis=1)) @ np.linalg.pinv(_smooth(ALWAYS_BLACK))
-"""Takes the always-black samples (B,) to the black level at the cells (48,)."""
+_ILLUMINATION = np.ascontiguousarray((_smooth(CELL_SAMPLES.mean(axis=1)) @ np.linalg.pinv(_smooth(ALWAYS_BLACK))).T)
+"""What each of the always-black samples adds to the black level at the cells (B, 48)."""
+SAMPLES_A_CELL = CELL_SAMPLES.shape[1]
+LEAST_LENGTH = 1e-9
+"""Brightnesses without their mean that are shorter than this have no contrast."""
 
 
 class Codebook:
@@ -106,7 +123,10 @@ class Codebook:
         self.false_accept_rate = false_accept_rate
         self.tau_hamming = tau_hamming
         self._codes = dictionary.oriented.reshape(-1, CELLS).astype(float)
-        self.unit_codes = [unit(self._codes @ mixing.T + around) for mixing, around in _mixings()]
+        self.unit_codes = np.stack([unit(self._codes @ mixing.T + around) for mixing, around in _mixings()])
+        """All readings (3, 4 N, 48) at each of ``BLUR_UNITS``, with zero mean and unit length."""
+        self._by_cell = np.ascontiguousarray(self.unit_codes.transpose(0, 2, 1))
+        self._upright = np.ascontiguousarray(self.unit_codes[:, ::4].transpose(1, 0, 2))
         self._threshold = lru_cache(maxsize=None)(partial(acceptance_threshold, len(self._codes)))
         self.least(1)  # refuses a rate that is none
 
@@ -141,25 +161,23 @@ class Codebook:
         """Return the best reading of each row of cells (Q, 48); ``side_px`` (Q,) is how large each square looks."""
         if len(cells) == 0:
             return []
-        levels = np.zeros(len(cells), dtype=int) if side_px is None else blur_level(side_px)
-        found = np.empty((len(cells), len(self._codes)))
-        for level in np.unique(levels):
-            rows = levels == level
-            found[rows] = np.einsum("qc,kc->qk", unit(cells[rows]), self.unit_codes[level])
-        return self._best(found, cells, np.ones(cells.shape, dtype=bool))
+        levels = np.zeros(len(cells), dtype=np.int64) if side_px is None else blur_level(side_px)
+        best, found = _best_codes(unit(cells), levels, self._by_cell)
+        return self._readings(best, found, cells, np.ones(cells.shape, dtype=bool))
 
     def read_seen(self, cells: Array, seen: NDArray[np.bool_]) -> list[Reading]:
         """Return the best reading of each row of cells (Q, 48) when only those that are ``seen`` (Q, 48) count."""
-        return self._best(correlations(cells, seen, self._codes), cells, seen)
-
-    def _best(self, found: Array, cells: Array, seen: NDArray[np.bool_]) -> list[Reading]:
-        """Return the readings that correlate best among all ``found`` (Q, 4 N)."""
+        found = correlations(cells, seen, self._codes)
         best = found.argmax(axis=1)
+        return self._readings(best, found[np.arange(len(best)), best], cells, seen)
+
+    def _readings(self, best: NDArray[np.int64], found: Array, cells: Array, seen: NDArray[np.bool_]) -> list[Reading]:
+        """Return the readings that are the ``best`` (Q,) of all codes, and correlate as ``found`` (Q,)."""
         wrong = hamming(cells, self.dictionary.oriented.reshape(-1, CELLS)[best], seen)
-        count = seen.sum(axis=1)
+        rows = zip(best.tolist(), found.tolist(), wrong.tolist(), seen.sum(axis=1).tolist(), strict=True)
         return [
-            Reading(self.dictionary.ids[b // 4], int(b % 4), float(found[q, b]), int(wrong[q]), cells=int(count[q]))
-            for q, b in enumerate(best)
+            Reading(self.dictionary.ids[code // 4], code % 4, correlation, differ, cells=count)
+            for code, correlation, differ, count in rows
         ]
 
     def read_as(self, cells: Array, marker_id: int, side_px: float | None = None) -> Reading:
@@ -168,13 +186,18 @@ class Codebook:
         One that looks ``side_px`` large, or as blurred as chance explains least.
         """
         row = self.dictionary.row(marker_id)
-        found = np.array([codes[4 * row] for codes in self.unit_codes]) @ unit(cells[None])[0]
+        found = (self._upright[row] @ unit(cells[None])[0]).tolist()
         if side_px is None:
-            level = int((found - [self.least(1, worth) for worth in BLURRED_CELLS]).argmax())
+            level = max(range(len(found)), key=lambda i: found[i] - self._least_of_levels[i])
         else:
-            level = int(blur_level(np.array(side_px)))
-        wrong = int(hamming(cells[None], self.dictionary.signatures[row][None])[0])
-        return Reading(marker_id, 0, float(found[level]), wrong, cells=BLURRED_CELLS[level])
+            level = int(blur_level(side_px))
+        wrong = int(hamming(cells[None], self.dictionary.signatures[row : row + 1])[0])
+        return Reading(marker_id, 0, found[level], wrong, cells=BLURRED_CELLS[level])
+
+    @cached_property
+    def _least_of_levels(self) -> list[float]:
+        """Return which correlation with codes at each of ``BLUR_UNITS`` chance rarely exceeds."""
+        return [self.least(1, worth) for worth in BLURRED_CELLS]
 
     def read_seen_as(self, cells: Array, seen: NDArray[np.bool_], marker_id: int) -> Reading:
         """Return how well the ``seen`` (48,) of cells (48,) fit an upright marker of a known identity."""
@@ -186,10 +209,9 @@ class Codebook:
         return Reading(marker_id, 0, correlation, wrong, cells=int(seen.sum()))
 
 
-def blur_level(side_px: Array) -> NDArray[np.int64]:
+def blur_level(side_px: ArrayLike) -> NDArray[np.int64]:
     """Return which of ``BLUR_UNITS`` is nearest to what a square ``side_px`` large looks like."""
-    width = PIXEL_BLUR * TEMPLATE_UNITS / np.maximum(side_px, 1.0)
-    return np.abs(np.asarray(width)[..., None] - BLUR_UNITS).argmin(axis=-1)
+    return np.searchsorted(_HALF_WAY, PIXEL_BLUR * TEMPLATE_UNITS / np.maximum(side_px, 1.0))
 
 
 @lru_cache(maxsize=1)
@@ -210,11 +232,38 @@ def _mixings() -> tuple[tuple[Array, Array], ...]:
     return tuple(mixings)
 
 
+@compiled(MATRIX)
 def unit(cells: Array) -> Array:
     """Return rows (Q, N) with zero mean and unit length; a row without contrast becomes zero."""
-    centred = cells - cells.mean(axis=1, keepdims=True)
-    length = np.linalg.norm(centred, axis=1, keepdims=True)
-    return centred / np.where(length > 1e-9, length, np.inf)
+    rows = np.empty_like(cells)
+    for q in range(len(cells)):
+        mean = cells[q].sum() / cells.shape[1]
+        energy = 0.0
+        for n in range(cells.shape[1]):
+            rows[q, n] = cells[q, n] - mean
+            energy += rows[q, n] ** 2
+        length = math.sqrt(energy)
+        for n in range(cells.shape[1]):
+            rows[q, n] *= 1 / length if length > LEAST_LENGTH else 0.0
+    return rows
+
+
+@compiled(MATRIX, INDICES, CUBE)
+def _best_codes(cells: Array, level: NDArray[np.int64], codes: Array) -> tuple[NDArray[np.int64], Array]:
+    """Return which code (Q,) each row of unit cells (Q, 48) correlates with best, and how well (Q,).
+
+    ``codes`` (L, 48, K) are of unit length, at the ``level`` (Q,) of blur of each row.
+    """
+    best, correlation = np.empty(len(cells), dtype=np.int64), np.empty(len(cells))
+    for q in range(len(cells)):
+        found = np.zeros(codes.shape[2])
+        for c in range(CELLS):
+            cell, white = cells[q, c], codes[level[q], c]
+            for k in range(len(found)):
+                found[k] += cell * white[k]
+        best[q] = found.argmax()
+        correlation[q] = found[best[q]]
+    return best, correlation
 
 
 def hamming(cells: Array, codes: NDArray[np.uint8], seen: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
@@ -222,29 +271,46 @@ def hamming(cells: Array, codes: NDArray[np.uint8], seen: NDArray[np.bool_] | No
 
     Half way between the means of those that its code (Q, 48) has black and white.
     """
-    white, black = codes == 1, codes == 0
-    if seen is None:
-        seen = np.ones(cells.shape, dtype=bool)
-    white, black = white & seen, black & seen
-    middle = sum((cells * part).sum(axis=1) / np.maximum(part.sum(axis=1), 1) for part in (white, black)) / 2
-    return (seen & ((cells > middle[:, None]) != white)).sum(axis=1)
+    return _wrong(cells, codes, np.ones(cells.shape, dtype=bool) if seen is None else seen)
 
 
-def sample(gray: Brightness, points_px: Array | NDArray[np.float32]) -> Array:
-    """Return gray or light values at pixels (N, M, 2), interpolated; 0 outside the image."""
-    points = np.clip(points_px.astype(np.float32, copy=False), -1e4, 1e4)
-    flat = points.reshape(-1, 1, 2)
-    if len(flat) < 32_000:
-        return cv2.remap(gray, flat, None, cv2.INTER_LINEAR).reshape(points.shape[:-1]).astype(float)
-    return cv2.remap(gray, points, None, cv2.INTER_LINEAR).astype(float)
+@compiled(MATRIX, BITS, FLAG_MATRIX)
+def _wrong(cells: Array, codes: NDArray[np.uint8], seen: NDArray[np.bool_]) -> NDArray[np.int64]:
+    wrong = np.zeros(len(cells), dtype=np.int64)
+    for q in range(len(cells)):
+        total, count = np.zeros(2), np.zeros(2)
+        for c in range(CELLS):
+            if seen[q, c]:
+                total[codes[q, c]] += cells[q, c]
+                count[codes[q, c]] += 1
+        half_way = (total[0] / max(count[0], 1.0) + total[1] / max(count[1], 1.0)) / 2
+        for c in range(CELLS):
+            wrong[q] += seen[q, c] and (cells[q, c] > half_way) != (codes[q, c] == 1)
+    return wrong
 
 
-def cell_values(gray: Brightness, samples_px: Array | NDArray[np.float32]) -> Array:
+def cell_values(gray: Brightness, samples_px: Places) -> Array:
     """Return the 48 cell means (Q, 48), black level removed, of patterns sampled at ``SAMPLES`` (Q, S, 2)."""
-    values = sample(gray, samples_px)
-    cells = values[:, : CELL_SAMPLES.shape[0] * CELL_SAMPLES.shape[1]].reshape(len(values), CELLS, -1).mean(axis=2)
-    # einsum, not @: products of this size wake BLAS threads that cost more than they save
-    return cells - np.einsum("qb,cb->qc", values[:, -len(ALWAYS_BLACK) :], _ILLUMINATION)
+    return _cells(gray, np.ascontiguousarray(samples_px), _ILLUMINATION)
+
+
+@compiled(BRIGHTNESS, PLACES_OF_MANY, MATRIX)
+def _cells(gray: NDArray, samples_px: NDArray, illumination: Array) -> Array:
+    """Return cells (Q, 48) of patterns sampled at cells, and where they are black, (Q, S, 2).
+
+    Each black sample adds a row of ``illumination`` (B, 48) to the black level at the cells.
+    """
+    cells = np.zeros((len(samples_px), CELLS))
+    values = np.empty(samples_px.shape[1])
+    for q in range(len(cells)):
+        for s in range(len(values)):
+            values[s] = bilinear(gray, samples_px[q, s, 0], samples_px[q, s, 1])
+        for c in range(CELLS):
+            cells[q, c] = values[c * SAMPLES_A_CELL : (c + 1) * SAMPLES_A_CELL].mean()
+        for b in range(len(illumination)):
+            for c in range(CELLS):
+                cells[q, c] -= values[CELLS * SAMPLES_A_CELL + b] * illumination[b, c]
+    return cells
 
 
 def layer_cells(gray: Brightness, warp: Warp, layer: int) -> Array:
@@ -265,6 +331,7 @@ class Artwork:
         self._expected: dict[tuple[int, float], Array] = {}
         span = np.linspace(-self.REACH, 1 + self.REACH, self.GRID) * TEMPLATE_UNITS
         self.points = np.stack(np.meshgrid(span, span), axis=-1).reshape(-1, 2)
+        self.points.flags.writeable = False  # so that warps may keep where they are on a surface
         """Where to sample (N, 2), as if the square were the outermost."""
 
     def expected(self, marker_id: int, side_px: float = np.inf) -> Array:
@@ -314,10 +381,29 @@ class Artwork:
         ``square_warp`` takes the template to the image as if the square were the outermost.
         Points outside the image do not count.
         """
-        at = square_warp(self.points)
-        height, width = gray.shape
-        inside = (at >= 0).all(axis=1) & (at[:, 0] <= width - 1) & (at[:, 1] <= height - 1)
-        if inside.sum() < 16:
-            return np.zeros(len(LAYERS))
-        seen = unit(sample(gray, at[None, inside]))[0]
-        return unit(self.expected(marker_id, side_px)[:, inside]) @ seen
+        at_px = np.ascontiguousarray(square_warp(self.points))
+        return _likenesses(gray, at_px, self.expected(marker_id, side_px))
+
+
+@compiled(GRAY, MATRIX, MATRIX)
+def _likenesses(gray: Image, at_px: Array, expected: Array) -> Array:
+    """Return the correlations (L,) of an image at those pixels (N, 2) that are inside it with pictures (L, N)."""
+    height, width = gray.shape
+    seen = np.zeros(len(at_px), dtype=np.int64)
+    count = 0
+    for n in range(len(at_px)):
+        if 0 <= at_px[n, 0] <= width - 1 and 0 <= at_px[n, 1] <= height - 1:
+            seen[count] = n
+            count += 1
+    likenesses = np.zeros(len(expected))
+    if count < LEAST_POINTS:
+        return likenesses
+    rows = np.empty((1 + len(expected), count))
+    for i in range(count):
+        rows[0, i] = between(gray, at_px[seen[i], 0], at_px[seen[i], 1])
+        for layer in range(len(expected)):
+            rows[1 + layer, i] = expected[layer, seen[i]]
+    rows = unit(rows)
+    for layer in range(len(expected)):
+        likenesses[layer] = (rows[0] * rows[1 + layer]).sum()
+    return likenesses

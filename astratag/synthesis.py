@@ -10,6 +10,7 @@ Gauss-Newton step costs one look-up.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
 from typing import Generic, TypeVar
@@ -18,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from astratag.compiled import CUBE, FLAGS, GRAY, INT, MATRIX, REAL, VECTOR, compiled
 from astratag.dictionary import Dictionary
 from astratag.geometry import (
     CELLS,
@@ -29,18 +31,24 @@ from astratag.geometry import (
     layer_points,
     square,
 )
+from astratag.looks import AROUND, BY_BLUR, BY_X, BY_Y, MEAN, OUTSIDE, looks
+from astratag.normal import left_over
+from astratag.steps import contrast, step, values
 from astratag.warp import FittedWarp
 
 Array = NDArray[np.float64]
 Light = NDArray[np.float32]
+Seen = NDArray[np.bool_]
+Seeing = tuple[Seen, Array, Array, Array]
 W = TypeVar("W", bound=FittedWarp)
 
-BLACK, WHITE, BEYOND = CELLS, CELLS + 1, CELLS + 2
-"""Labels of what is always ink, always paper, and no longer the print; cells are labelled by their number."""
-LABELS = BEYOND + 1
+BLACK, WHITE, BEYOND = range(3)
+"""Labels of what is always ink, always paper, and no longer the print; the cells' follow in their order."""
+FIRST_CELL = BEYOND + 1
+LABELS = FIRST_CELL + CELLS
+OF_COMMON = 3 + FIRST_CELL
+"""What all identities have in common: light that varies in a plane, and the labels that are no cells."""
 KEPT_PICTURES = 64
-OUTSIDE = 0.3
-"""How far beyond the black square there are labels, as a fraction of its side."""
 NODES, MANY_NODES = 24, 64
 """Points that stand for the Gaussian a pixel sees through: of a picture blurred beforehand, and of a sharp one."""
 SOFTNESS = tuple(4.0 * 2 ** (k / 2) for k in range(10))
@@ -59,18 +67,10 @@ SIGMA_FLOOR_PX = 0.02
 FINELY_SAMPLED_PX, COARSENESS = 64.0, 1.5
 """Prints that look larger are sampled so coarsely that this grows, by this power of their size."""
 LEAST_BLUR_PX, MOST_BLUR_PX = 0.5, 8.0
-BLUR_STEP = 0.3
-"""How far one step may take the logarithm of the blur, as a standard deviation."""
-STEP_PX = 1.0
-"""How far one step may take a point of the print, as a standard deviation."""
+HALF_UNIT = 0.5
+"""How far derivatives by place reach, template units."""
 STEPS, SETTLED_PX = 6, 0.02
 FEWEST_POINTS = 60
-LEAST_REST = 0.02
-"""Fraction of the blur's variance that is always left to the nodes."""
-INTERPOLATED = 9 / 4
-"""Variance of a pixel's noise over that of values interpolated between pixels."""
-LEAST_NOISE = 0.3
-"""No light is believed to be known better than this, of 255."""
 
 
 def _labels() -> NDArray[np.uint8]:
@@ -91,13 +91,14 @@ def _labels() -> NDArray[np.uint8]:
     for layer in LAYERS:
         fill(square(*(layer.frame or (-margin, TEMPLATE_UNITS + margin))), WHITE)
         fill(square(*layer.black), BLACK)
-        for label, cell in enumerate(cell_polygons() + DRAWN_OFFSET):
+        for label, cell in enumerate(cell_polygons() + DRAWN_OFFSET, start=FIRST_CELL):
             fill(layer_points(cell, layer), label)
     return picture
 
 
 _LABELS = _labels()
 _OUTER = square(0.0, TEMPLATE_UNITS)
+_OUTER.flags.writeable = False  # so that warps may keep where it is on a surface
 
 
 def _nodes(count: int) -> Array:
@@ -109,7 +110,7 @@ def _nodes(count: int) -> Array:
     radius, angle = np.sqrt(-2 * np.log(1 - i / count)), i * np.pi * (3 - np.sqrt(5.0))
     nodes = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     nodes -= nodes.mean(axis=0)
-    return np.linalg.solve(np.linalg.cholesky(nodes.T @ nodes / count), nodes.T).T
+    return np.ascontiguousarray(np.linalg.solve(np.linalg.cholesky(nodes.T @ nodes / count), nodes.T).T)
 
 
 _NODES, _MANY_NODES = _nodes(NODES), _nodes(MANY_NODES)
@@ -120,10 +121,12 @@ _MOMENTS = (np.stack([_X**0, _X, _Y, _X * _X - 1, _X * _Y, _Y * _Y - 1]) / NODES
 
 @cache
 def _grid(lines: int, reach: float) -> tuple[Array, Array]:
-    """Return template points (lines^2, 2), and them and two neighbours half a unit on (3, lines^2, 2)."""
+    """Return template points (lines^2, 2), and them and two neighbours half a unit on (3 lines^2, 2)."""
     span = np.linspace(-reach, 1 + reach, lines) * TEMPLATE_UNITS
     points = np.stack(np.meshgrid(span, span), axis=-1).reshape(-1, 2)
-    return points, np.stack([points, points + (0.5, 0.0), points + (0.0, 0.5)])
+    stencil = np.concatenate([points, points + (HALF_UNIT, 0.0), points + (0.0, HALF_UNIT)])
+    points.flags.writeable = stencil.flags.writeable = False  # so that warps may keep where they are on a surface
+    return points, stencil
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,46 +142,71 @@ class Look:
     to_template: Array
     weight: Array
 
+    @cached_property
+    def finest(self) -> float:
+        """Return the template units of a pixel the way it has fewest: a tenth of the points have still fewer."""
+        ordered = np.sort(_fewest(self.to_template))
+        below, part = divmod(0.1 * (len(ordered) - 1), 1)
+        return float(ordered[int(below)] * (1 - part) + ordered[int(below) + 1] * part)
+
     def softness(self, blur_px: float) -> float:
         """Return the softest of ``SOFTNESS`` that a picture may have to be seen through a blur, 0 for a sharp one."""
-        a, b, c, d = self.to_template.reshape(-1, 4).T
-        total, area = a * a + b * b + c * c + d * d, a * d - b * c
-        least = np.sqrt(np.maximum(total - np.sqrt(np.maximum(total**2 - 4 * area**2, 0)), 0) / 2)
-        limit = SOFT_SHARE * blur_px * np.quantile(least, 0.1)
+        limit = SOFT_SHARE * blur_px * self.finest
         return max((softness for softness in SOFTNESS if softness <= limit), default=0.0)
-
-    @cached_property
-    def root(self) -> Array:
-        """Return the roots of the weights (N,)."""
-        return np.sqrt(self.weight)
-
-    @cached_property
-    def plane(self) -> Array:
-        """Return what light that varies in a plane over the print is made of (N, 3)."""
-        return np.column_stack([np.ones(len(self.weight)), self.template / TEMPLATE_UNITS - 0.5])
 
 
 def _widest_px(warp: FittedWarp) -> float:
     """Return how long the longest side of a print looks, at least a pixel."""
-    corners = warp(_OUTER)
-    return max(float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).max()), 1.0)
+    p0, p1, p2, p3 = warp(_OUTER).tolist()
+    return max(math.dist(p0, p1), math.dist(p1, p2), math.dist(p2, p3), math.dist(p3, p0), 1.0)
+
+
+@compiled(MATRIX, FLAGS, INT, INT, REAL)
+def _seen(stencil_px: Array, visible: Seen, height: int, width: int, spacing: float) -> Seeing:
+    """Return which of N points (N,) are seen in an image; and where, what takes pixels to template units, and weights.
+
+    ``stencil_px`` (3 N, 2) is where they are, and then their neighbours half a unit on; ``spacing`` the template units
+    between them.  Of the M that are seen come pixels (M, 2), matrices (M, 2, 2) and weights (M,).
+    """
+    count = len(visible)
+    use = np.zeros(count, dtype=np.bool_)
+    at_px, to_template, weight = np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count)
+    m = 0
+    for n in range(count):
+        x, y = stencil_px[n, 0], stencil_px[n, 1]
+        a, c = (stencil_px[count + n, 0] - x) / HALF_UNIT, (stencil_px[count + n, 1] - y) / HALF_UNIT
+        b, d = (stencil_px[2 * count + n, 0] - x) / HALF_UNIT, (stencil_px[2 * count + n, 1] - y) / HALF_UNIT
+        area = a * d - b * c
+        if visible[n] and area > 1e-9 and 1 <= x <= width - 2 and 1 <= y <= height - 2:
+            use[n] = True
+            at_px[m, 0], at_px[m, 1] = x, y
+            to_template[m, 0, 0], to_template[m, 0, 1] = d / area, -b / area
+            to_template[m, 1, 0], to_template[m, 1, 1] = -c / area, a / area
+            weight[m] = min(spacing**2 * area, 1.0)
+            m += 1
+    return use, at_px[:m], to_template[:m], weight[:m]
+
+
+@compiled(CUBE)
+def _fewest(to_template: Array) -> Array:
+    """Return the smaller singular values (N,) of matrices (N, 2, 2)."""
+    fewest = np.empty(len(to_template))
+    for n in range(len(fewest)):
+        a, b, c, d = to_template[n, 0, 0], to_template[n, 0, 1], to_template[n, 1, 0], to_template[n, 1, 1]
+        total, area = a * a + b * b + c * c + d * d, a * d - b * c
+        fewest[n] = math.sqrt(max(total - math.sqrt(max(total * total - 4 * area * area, 0.0)), 0.0) / 2)
+    return fewest
 
 
 def look(warp: FittedWarp, shape: tuple[int, ...], reach: float = REACH) -> Look | None:
     """Return how a print and ``reach`` sides around it lie in an image of ``shape`` (H, W); None when hardly at all."""
-    lines = int(np.clip(_widest_px(warp) * (1 + 2 * reach) / SPACING_PX, FEWEST_LINES, MOST_LINES))
+    lines = int(min(max(_widest_px(warp) * (1 + 2 * reach) / SPACING_PX, FEWEST_LINES), MOST_LINES))
     points, stencil = _grid(lines, reach)
-    at, right, below = warp(stencil.reshape(-1, 2)).reshape(3, -1, 2)
-    J = 2 * np.stack([right - at, below - at], axis=2)
-    determinant = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
-    use = (determinant > 1e-9) & (at >= 1).all(axis=1) & (at <= (shape[1] - 2, shape[0] - 2)).all(axis=1)
-    use &= warp.visible(points)
-    if use.sum() < FEWEST_POINTS:
+    spacing = TEMPLATE_UNITS * (1 + 2 * reach) / (lines - 1)
+    use, *seen = _seen(np.ascontiguousarray(warp(stencil)), warp.visible(points), shape[0], shape[1], spacing)
+    if len(seen[0]) < FEWEST_POINTS:
         return None
-    step = TEMPLATE_UNITS * (1 + 2 * reach) / (lines - 1)
-    (a, b), (c, d) = J[use].transpose(1, 2, 0)
-    inverse = np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2) / determinant[use, None, None]
-    return Look(points[use], at[use], inverse, np.minimum(step**2 * determinant[use], 1.0))
+    return Look(points if len(seen[0]) == len(points) else points[use], *seen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,14 +216,6 @@ class Picture:
     channels: Light
     softness: float
     texel: float
-
-    def at(self, template: Array, lxx: Array, lyx: Array, lyy: Array) -> Light:
-        """Return the channels (N, K, 2) at nodes around template points (N, 2), spread by Cholesky factors (N,)."""
-        x, y = _NODES.T.astype(np.float32)
-        middle = ((template + OUTSIDE * TEMPLATE_UNITS) / self.texel - 0.5).astype(np.float32)
-        xx, yx, yy = ((part / self.texel).astype(np.float32)[:, None] for part in (lxx, lyx, lyy))
-        columns, rows = middle[:, :1] + xx * x, middle[:, 1:] + yx * x + yy * y
-        return cv2.remap(self.channels, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,24 +234,14 @@ class Expected:
 
 def expected(seen: Look, picture: Picture, blur_px: float) -> Expected:
     """Return what a print should look like through a blur, which is at least its picture's."""
-    ax, ay, bx, by = blur_px * seen.to_template.reshape(-1, 4).T
-    cxx, cxy, cyy = ax * ax + ay * ay, ax * bx + ay * by, bx * bx + by * by  # the blur's covariance on the print
-    soft = picture.softness**2
-    lxx = np.sqrt(np.maximum(cxx - soft, LEAST_REST * cxx))  # Cholesky factor of what the picture leaves of it
-    lyx = cxy / lxx
-    lyy = np.sqrt(np.maximum(cyy - soft - lyx**2, LEAST_REST * (ax * by - ay * bx) ** 2 / cxx))
-    channels = picture.at(seen.template, lxx, lyx, lyy)
-    mean, x, y, xx, xy, yy = _MOMENTS @ np.ascontiguousarray(channels[..., 0]).T
-    x, y = x / lxx - y * lyx / (lxx * lyy), y / lyy  # derivatives on the print
-    dxx, dyx, dyy = 1 / lxx, -lyx / (lxx * lyy), 1 / lyy
-    mxx, mxy = dxx * dxx * cxx, dxx * (dyx * cxx + dyy * cxy)
-    myy = dyx * dyx * cxx + 2 * dyx * dyy * cxy + dyy * dyy * cyy
-    return Expected(
-        mean=mean.astype(float),
-        by_place=(x[:, None] * seen.to_template[:, 0] + y[:, None] * seen.to_template[:, 1]),
-        by_blur=mxx * xx + 2 * mxy * xy + myy * yy,
-        beyond=channels[..., 1].mean(axis=1).astype(float),
-    )
+    rows = looks_of(seen, picture, blur_px)
+    return Expected(rows[MEAN], rows[BY_X : BY_Y + 1].T, rows[BY_BLUR], rows[AROUND])
+
+
+def looks_of(seen: Look, picture: Picture, blur_px: float) -> Array:
+    """Return the same as rows (5, N), in the order of ``steps``."""
+    of_picture = picture.channels, picture.softness, picture.texel
+    return looks(seen.template, seen.to_template, *of_picture, blur_px, _NODES, _MOMENTS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,6 +279,44 @@ class Alignment(Generic[W]):
         return SIGMA_FLOOR_PX * max(1.0, _widest_px(self.warp) / FINELY_SAMPLED_PX) ** COARSENESS
 
 
+@compiled(GRAY, MATRIX, CUBE, VECTOR, VECTOR, MATRIX)
+def _products(
+    labels: NDArray[np.uint8], template: Array, to_template: Array, weight: Array, value: Array, nodes_px: Array
+) -> Array:
+    """Return the products (55, 55), summed over N weighted points, of what their light is made of, and of that itself.
+
+    It is made of a plane over the print (3) and of the shares (51) that labels have in what a point sees, at
+    ``nodes_px`` (K, 2) around it; each point sees but a few.
+    """
+    last = 3 + LABELS
+    products, column = np.zeros((last + 1, last + 1)), np.zeros(last + 1)
+    share = 1 / len(nodes_px)
+    which = np.zeros(4 + len(nodes_px), dtype=np.int64)
+    which[:4] = 0, 1, 2, last
+    for n in range(len(template)):
+        u, v = template[n, 0], template[n, 1]
+        column[0], column[1], column[2] = 1.0, u / TEMPLATE_UNITS - 0.5, v / TEMPLATE_UNITS - 0.5
+        column[last] = value[n]
+        count = 4
+        for k in range(len(nodes_px)):
+            x = u + to_template[n, 0, 0] * nodes_px[k, 0] + to_template[n, 0, 1] * nodes_px[k, 1]
+            y = v + to_template[n, 1, 0] * nodes_px[k, 0] + to_template[n, 1, 1] * nodes_px[k, 1]
+            at_column = min(max(int(x + OUTSIDE * TEMPLATE_UNITS), 0), labels.shape[1] - 1)
+            at_row = min(max(int(y + OUTSIDE * TEMPLATE_UNITS), 0), labels.shape[0] - 1)
+            label = 3 + labels[at_row, at_column]
+            if column[label] == 0:
+                which[count] = label
+                count += 1
+            column[label] += share
+        for i in which[:count]:
+            weighted = weight[n] * column[i]
+            for j in which[:count]:
+                products[i, j] += weighted * column[j]
+        for i in which[:count]:
+            column[i] = 0.0
+    return products
+
+
 class Synthesis:
     """The prints of a dictionary, ready to be compared with images pixel by pixel."""
 
@@ -285,16 +333,11 @@ class Synthesis:
         seen = look(warp, light.shape)
         if seen is None:
             return np.zeros((len(self._codes) // 4, 4))
-        places = seen.template[:, None] + (blur_px * _MANY_NODES) @ seen.to_template.transpose(0, 2, 1)
-        texels = (places + (OUTSIDE * TEMPLATE_UNITS - 0.5)).astype(np.float32)
-        labels = cv2.remap(_LABELS, texels, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
-        rows = np.arange(len(labels), dtype=np.int64)[:, None] * LABELS + labels
-        share = np.bincount(rows.ravel(), minlength=len(labels) * LABELS).reshape(-1, LABELS) / MANY_NODES
-        nuisance = np.column_stack([seen.plane, share[:, BLACK:]])  # the shares add up to one
-        left = _left(seen, nuisance, np.column_stack([share[:, :CELLS], _values(light, seen)]))
-        B, value = left[:, :CELLS], left[:, CELLS]
-        gram, common = B.T @ B, B.T @ value
-        length = np.sqrt(((self._codes @ gram) * self._codes).sum(axis=1) * (value @ value))
+        value = values(light, seen.at_px)
+        products = _products(_LABELS, seen.template, seen.to_template, seen.weight, value, blur_px * _MANY_NODES)
+        left = left_over(products, OF_COMMON)
+        among, common, energy = left[:CELLS, :CELLS], left[:CELLS, CELLS], left[CELLS, CELLS]
+        length = np.sqrt(((self._codes @ among) * self._codes).sum(axis=1) * energy)
         return (self._codes @ common / np.maximum(length, 1e-9)).reshape(-1, 4)
 
     def layer_scores(self, light: Light, square_warp: FittedWarp, marker_id: int, blur_px: float) -> Array:
@@ -305,13 +348,13 @@ class Synthesis:
         seen = look(square_warp, light.shape, LAYER_REACH)
         if seen is None:
             return np.zeros(len(LAYERS))
-        value, scores = _values(light, seen), np.zeros(len(LAYERS))
+        value, scores = values(light, seen.at_px), np.zeros(len(LAYERS))
         for layer in LAYERS:
             there = replace(
                 seen, template=layer_points(seen.template, layer), to_template=layer.scale * seen.to_template
             )
-            looks = expected(there, self._picture(marker_id, there.softness(blur_px)), blur_px)
-            scores[layer.index] = _contrast(seen, np.column_stack([seen.plane, looks.beyond]), value, looks.mean)[1]
+            shown = looks_of(there, self._picture(marker_id, there.softness(blur_px)), blur_px)
+            scores[layer.index] = contrast(seen.template, seen.weight, value, shown)[1]
         return scores
 
     def align(
@@ -328,29 +371,21 @@ class Synthesis:
         Light and contrast may each vary in a plane over the print.  A step that moves it by less than ``settled_px`` is
         the last.
         """
-        size = len(warp.step_sigma())
         alignment = None
         for _ in range(steps):
             seen = look(warp, light.shape)
             if seen is None:
                 return None
-            looks = expected(seen, self._picture(marker_id, seen.softness(blur_px)), blur_px)
-            value = _values(light, seen)
-            level = np.column_stack([seen.plane, looks.beyond])
-            contrast, correlation = _contrast(seen, level, value, looks.mean)
-            if contrast <= 0:
+            shown = looks_of(seen, self._picture(marker_id, seen.softness(blur_px)), blur_px)
+            J = np.ascontiguousarray(warp.jacobian(seen.template))
+            x, covariance, apart, correlation, moved_px = step(
+                light, seen.at_px, seen.template, seen.weight, shown, J, warp.step_sigma()
+            )
+            if apart <= 0:
                 return None
-            J = warp.jacobian(seen.template)
-            by_warp = -contrast * (looks.by_place[:, :1] * J[:, 0] + looks.by_place[:, 1:] * J[:, 1])
-            of_light = (seen.plane * looks.mean[:, None], level)
-            A = np.column_stack([by_warp, contrast * looks.by_blur, *of_light]) * seen.root[:, None]
-            reach = np.maximum(np.abs(J).max(axis=(0, 1)), 1e-12)
-            step_sigma = np.append(np.minimum(STEP_PX / reach, warp.step_sigma()), BLUR_STEP)
-            x, covariance = _least_squares(A, value * seen.root, step_sigma, float(seen.weight.sum()))
-            warp = warp.stepped(x[:size])
-            blur_px = float(np.clip(blur_px * np.exp(x[size]), LEAST_BLUR_PX, MOST_BLUR_PX))
-            moved_px = float(np.abs(J @ x[:size]).max())
-            alignment = Alignment(warp, blur_px, correlation, covariance[:size, :size], moved_px)
+            warp = warp.stepped(x[:-1])
+            blur_px = min(max(blur_px * math.exp(x[-1]), LEAST_BLUR_PX), MOST_BLUR_PX)
+            alignment = Alignment(warp, blur_px, correlation, covariance[:-1, :-1], moved_px)
             if moved_px < settled_px:
                 break
         return alignment
@@ -363,7 +398,8 @@ class Synthesis:
 def _picture(signature: bytes, softness: float) -> Picture:
     """Return the print of a signature (48 bytes) blurred by ``softness`` template units, 0 for not at all."""
     levels = np.zeros((2, 256), np.uint8)
-    levels[0, :LABELS] = 255 * np.append(np.frombuffer(signature, np.uint8), (0, 1, 0))
+    levels[0, WHITE] = 255
+    levels[0, FIRST_CELL:LABELS] = 255 * np.frombuffer(signature, np.uint8)
     levels[1, BEYOND] = 255
     size = max(round(len(_LABELS) * min(TEXELS / softness, 1.0)), 1) if softness else len(_LABELS)
     texel = len(_LABELS) / size
@@ -375,36 +411,3 @@ def _picture(signature: bytes, softness: float) -> Picture:
             cv2.GaussianBlur(small, (0, 0), deviation, borderType=cv2.BORDER_REPLICATE) if softness else small
         )
     return Picture(cv2.merge(channels), softness, texel)
-
-
-def _values(light: Light, seen: Look) -> Array:
-    return cv2.remap(light, seen.at_px.astype(np.float32)[None], None, cv2.INTER_LINEAR)[0].astype(float)
-
-
-def _left(seen: Look, nuisance: Array, columns: Array) -> Array:
-    """Return columns (N, K), weighted, with what the nuisance (N, M) explains taken out."""
-    Q = np.linalg.qr(nuisance * seen.root[:, None])[0]
-    columns = columns * seen.root[:, None]
-    return columns - Q @ (Q.T @ columns)
-
-
-def _contrast(seen: Look, nuisance: Array, value: Array, looks: Array) -> tuple[float, float]:
-    """Return how many units of light black and white are apart, and how values correlate with what is expected."""
-    left, right = _left(seen, nuisance, np.stack([value, looks], axis=1)).T
-    energy, common = float(right @ right) + 1e-12, float(left @ right)
-    return common / energy, common / float(np.sqrt(energy * (left @ left + 1e-12)))
-
-
-def _least_squares(A: Array, value: Array, step_sigma: Array, pixels: float) -> tuple[Array, Array]:
-    """Return the unknowns (P,) of A x = value, the first held by their step sigmas, and their covariance (P, P)."""
-    scale = np.sqrt(np.einsum("np,np->p", A, A)) + 1e-12
-    A = A / scale
-    normal, right = A.T @ A, A.T @ value
-    free = np.linalg.solve(normal + 1e-9 * np.eye(len(right)), right)
-    residual = value - A @ free
-    variance = INTERPOLATED * float(residual @ residual) / max(pixels - len(free), 1.0) + LEAST_NOISE**2
-    prior = np.full(len(right), 1e-9)
-    prior[: len(step_sigma)] += variance / (step_sigma * scale[: len(step_sigma)]) ** 2
-    x = np.linalg.solve(normal + np.diag(prior), right)
-    covariance = variance * np.linalg.inv(normal + 1e-9 * np.eye(len(right)))
-    return x / scale, covariance / np.outer(scale, scale)

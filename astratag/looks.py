@@ -1,0 +1,129 @@
+"""Looks: what points of a print look like through a warp and a blur, as sums over what is around them.  Compiled.
+
+See ``synthesis``.  A point's looks are black 0 to white 1.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from astratag.compiled import CHANNELS, CUBE, INDEX, INT, LIGHT, MATRIX, REAL, SINGLE, compiled
+from astratag.geometry import TEMPLATE_UNITS
+
+Array = NDArray[np.float64]
+Light = NDArray[np.float32]
+
+MEAN, BY_X, BY_Y, BY_BLUR, AROUND = range(5)
+"""Rows of looks: brightness, its derivatives by pixels and by the logarithm of the blur, and the share of what a point
+sees that is beyond the print."""
+LOOKS = AROUND + 1
+OUTSIDE = 0.3
+"""How far beyond the black square pictures of a print reach, as a fraction of its side."""
+HAIR = 1e-3
+"""What is beyond a picture lies so many texels before its last one, so that there is always a next."""
+LEAST_REST = 0.02
+"""Fraction of the blur's variance that is always left to the nodes."""
+
+
+@compiled(MATRIX, REAL)
+def _covariance(to_template: Array, blur_px: float) -> tuple[float, float, float]:
+    """Return xx, xy and yy of a blur on the print; ``to_template`` (2, 2) takes pixels there."""
+    (ax, ay), (bx, by) = (to_template[0, 0], to_template[0, 1]), (to_template[1, 0], to_template[1, 1])
+    square_px = blur_px * blur_px
+    return square_px * (ax * ax + ay * ay), square_px * (ax * bx + ay * by), square_px * (bx * bx + by * by)
+
+
+@compiled(REAL, REAL, REAL, REAL)
+def _factor(cxx: float, cxy: float, cyy: float, softness: float) -> tuple[float, float, float]:
+    """Return xx, yx and yy of the lower Cholesky factor of what a picture's softness leaves of a blur's covariance."""
+    lxx = math.sqrt(max(cxx - softness * softness, LEAST_REST * cxx))
+    lyx = cxy / lxx
+    least = LEAST_REST * (cxx * cyy - cxy * cxy) / cxx
+    return lxx, lyx, math.sqrt(max(cyy - softness * softness - lyx * lyx, least))
+
+
+@compiled(SINGLE, INT)
+def _texel(x: np.float32, size: int) -> tuple[np.uint32, np.float32]:
+    """Return the texel, of ``size``, that is before a place, and how far the place is from there to the next.
+
+    Unsigned, so that it is not looked at for being negative.
+    """
+    last = np.float32(size - 1 - HAIR)
+    x = x if x > 0 else np.float32(0)
+    x = x if x < last else last
+    before = np.int32(x)
+    return np.uint32(before), x - np.float32(before)
+
+
+@compiled(CHANNELS, INDEX, INDEX, SINGLE, SINGLE, INT)
+def _mixed(
+    channels: Light, row: np.uint32, column: np.uint32, down: np.float32, right: np.float32, channel: int
+) -> np.float32:
+    """Return one channel between a texel and the next ones."""
+    next_row, next_column = np.uint32(row + np.uint32(1)), np.uint32(column + np.uint32(1))
+    left, upper = channels[row, column, channel], channels[row, next_column, channel]
+    left += down * (channels[next_row, column, channel] - left)
+    upper += down * (channels[next_row, next_column, channel] - upper)
+    return left + right * (upper - left)
+
+
+@compiled(CHANNELS, LIGHT, LIGHT, LIGHT)
+def _sums(channels: Light, spreads: Light, nodes: Light, moments: Light) -> Light:
+    """Return six moments of the brightness at nodes (K, 2) around each of N points, and the mean beyond (7, N).
+
+    ``spreads`` (5, N) are texels: x and y, and Cholesky factors xx, yx and yy that spread the nodes.  Points go in
+    the inner loops, and in single precision, so that they become vector instructions.
+    """
+    count = spreads.shape[1]
+    sums, brightness = np.zeros((7, count), dtype=np.float32), np.empty(count, dtype=np.float32)
+    share = np.float32(1 / len(nodes))
+    for k in range(len(nodes)):
+        u, v = nodes[k, 0], nodes[k, 1]
+        for n in range(count):
+            x, y = spreads[0, n] + spreads[2, n] * u, spreads[1, n] + spreads[3, n] * u + spreads[4, n] * v
+            column, right = _texel(x, channels.shape[1])
+            row, down = _texel(y, channels.shape[0])
+            brightness[n] = _mixed(channels, row, column, down, right, 0)
+            sums[6, n] += share * _mixed(channels, row, column, down, right, 1)
+        for m in range(6):
+            to, moment = sums[m], moments[m, k]
+            for n in range(count):
+                to[n] += moment * brightness[n]
+    return sums
+
+
+@compiled(MATRIX, CUBE, CHANNELS, REAL, REAL, REAL, MATRIX, LIGHT)
+def looks(
+    template: Array,
+    to_template: Array,
+    channels: Light,
+    softness: float,
+    texel: float,
+    blur_px: float,
+    nodes: Array,
+    moments: Light,
+) -> Array:
+    """Return what points (N, 2) should look like (5, N): by sums over nodes (K, 2) around each, ``moments`` (6, K)."""
+    count = len(template)
+    rows, spreads = np.empty((LOOKS, count)), np.empty((5, count), dtype=np.float32)
+    for n in range(count):
+        lxx, lyx, lyy = _factor(*_covariance(to_template[n], blur_px), softness)
+        spreads[0, n] = (template[n, 0] + OUTSIDE * TEMPLATE_UNITS) / texel - 0.5
+        spreads[1, n] = (template[n, 1] + OUTSIDE * TEMPLATE_UNITS) / texel - 0.5
+        spreads[2, n], spreads[3, n], spreads[4, n] = lxx / texel, lyx / texel, lyy / texel
+    sums = _sums(channels, spreads, nodes.astype(np.float32), moments)
+    for n in range(count):
+        cxx, cxy, cyy = _covariance(to_template[n], blur_px)
+        lxx, lyx, lyy = _factor(cxx, cxy, cyy, softness)
+        dxx, dyx, dyy = 1 / lxx, -lyx / (lxx * lyy), 1 / lyy
+        x, y = dxx * sums[1, n] + dyx * sums[2, n], dyy * sums[2, n]  # derivatives on the print
+        mxx, mxy = dxx * dxx * cxx, dxx * (dyx * cxx + dyy * cxy)
+        myy = dyx * dyx * cxx + 2 * dyx * dyy * cxy + dyy * dyy * cyy
+        rows[MEAN, n], rows[AROUND, n] = sums[0, n], sums[6, n]
+        rows[BY_X, n] = x * to_template[n, 0, 0] + y * to_template[n, 1, 0]
+        rows[BY_Y, n] = x * to_template[n, 0, 1] + y * to_template[n, 1, 1]
+        rows[BY_BLUR, n] = mxx * sums[3, n] + 2 * mxy * sums[4, n] + myy * sums[5, n]
+    return rows
