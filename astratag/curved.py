@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
 import cv2
@@ -26,7 +27,7 @@ from astratag.geometry import (
 )
 from astratag.grow import ALL_EDGES, Fit, Light, layer_side_px, settle
 from astratag.neighbours import Crossings
-from astratag.search import NARROW, Binarisation, Outlines, find_outlines
+from astratag.search import Binarisation, Contour, Outlines, find_outlines, starts_of
 from astratag.signature import SAMPLES, Artwork, Codebook, Warp, cell_values, layer_cells, sample, unit
 from astratag.warp import OUTSIDE_PX, FittedWarp
 
@@ -78,42 +79,50 @@ _CELL_MIDDLES = cell_polygons().mean(axis=1)
 def fine_outlines(gray: Image) -> Outlines:
     """Return the outlines of dark shapes at twice the resolution: rings about to close where the print turns away."""
     twice = cv2.resize(gray, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
-    return find_outlines(twice, FINE)._replace(scale=0.5)
+    return replace(find_outlines(twice, FINE), scale=0.5)
 
 
-def near_sides(gray: Image) -> Array:
+def near_sides(outlines: Outlines) -> Array:
     """Return sides (Q, 2, 2) of dark shapes that may be a square's, clockwise, however its other sides go on.
 
     The far side of a print may lie at the limb, or its ink run into what is dark behind it.  Both corners of the near
     side are seen, and how the sides beside it begin.
     """
-    ink = cv2.adaptiveThreshold(
-        gray, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, NARROW.window_px, NARROW.offset
-    )
-    found: list[Array] = []
-    for contour in cv2.findContours(ink, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)[0]:
-        if len(contour) >= 4 and max(cv2.boundingRect(contour)[2:]) >= LEAST_NEAR_PX:
-            polygon = cv2.approxPolyDP(contour, NEAR_TOLERANCE_PX, True)[::-1, 0].astype(float)
-            if len(polygon) >= 4:
-                found += _near_sides(polygon)
-    found.sort(key=lambda side: -float(np.linalg.norm(side[1] - side[0])))
-    return np.array(found[:MAX_NEAR]).reshape(-1, 2, 2)
+    contours = [contour for contour in outlines.others if len(contour) >= 4]
+    if not contours:
+        return np.zeros((0, 2, 2))
+    points, starts = np.concatenate(contours)[:, 0], starts_of(contours)
+    extent = np.maximum.reduceat(points, starts) - np.minimum.reduceat(points, starts)
+    large = np.flatnonzero(extent.max(axis=1) >= LEAST_NEAR_PX / outlines.scale)
+    polygons = [cv2.approxPolyDP(contours[i], NEAR_TOLERANCE_PX / outlines.scale, True)[::-1] for i in large]
+    sides = _near_sides([polygon for polygon in polygons if len(polygon) >= 4], outlines.scale)
+    return outlines.in_image(sides)
 
 
-def _near_sides(polygon: Array) -> list[Array]:
-    """Return the long sides (2, 2) of a clockwise polygon (N, 2) that lie between two corners."""
-    ahead = np.roll(polygon, -1, axis=0) - polygon
-    length = np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)
+def _near_sides(polygons: Sequence[Contour], scale: float) -> Array:
+    """Return the long sides (Q, 2, 2) of clockwise polygons (N, 1, 2) that lie between two corners, the longest first.
+
+    ``scale`` is how many pixels of the image theirs are wide.
+    """
+    if not polygons:
+        return np.zeros((0, 2, 2))
+    starts, at = starts_of(polygons), np.concatenate(polygons)[:, 0].astype(float)
+    next_one, last_one = np.arange(len(at)) + 1, np.arange(len(at)) - 1
+    ends = np.append(starts[1:], len(at)) - 1
+    next_one[ends], last_one[starts] = starts, ends
+    ahead = at[next_one] - at
+    length = np.maximum(np.sqrt((ahead * ahead).sum(axis=1)), 1e-9)
     along = ahead / length[:, None]
-    before, after = np.roll(along, 1, axis=0), np.roll(along, -1, axis=0)
+    before, after = along[last_one], along[next_one]
     turn = np.arctan2(before[:, 0] * along[:, 1] - before[:, 1] * along[:, 0], (before * along).sum(axis=1))
     corner = (turn > LEAST_TURN_RAD) & (turn < np.pi - LEAST_TURN_RAD)
-    beside = np.minimum(np.roll(length, 1), np.roll(length, -1))
+    beside = scale * np.minimum(length[last_one], length[next_one])
     alike = -(before * after).sum(axis=1) > LEAST_ALIKE
-    use = corner & np.roll(corner, -1) & (length >= LEAST_NEAR_PX) & (beside >= LEAST_BESIDE_PX) & alike
+    use = corner & corner[next_one] & (scale * length >= LEAST_NEAR_PX) & (beside >= LEAST_BESIDE_PX) & alike
+    longest = np.flatnonzero(use)[np.argsort(-length[use], kind="stable")[:MAX_NEAR]]
     outward = np.stack([along[:, 1], -along[:, 0]], axis=1)
-    outset_px = NEAR_OUTSET_PX * np.stack([outward - along, outward + along], axis=1)
-    return list((np.stack([polygon, np.roll(polygon, -1, axis=0)], axis=1) + outset_px)[use])
+    outset = NEAR_OUTSET_PX / scale * np.stack([outward - along, outward + along], axis=1)
+    return (np.stack([at, at[next_one]], axis=1) + outset)[longest]
 
 
 def curved_candidates(gray: Image, bent: Bent, codebook: Codebook) -> list[Candidate]:

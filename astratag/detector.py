@@ -123,12 +123,12 @@ class Detector(Confirmer):
         """
         if min(view.gray.shape) < LEAST_IMAGE_PX:
             return []
-        found = self.search(view, find_outlines(view.gray, COARSE), whole=True)
+        found = self.search(view, _outlines(view, COARSE), whole=True)
         large = view.gray.size > HALVE_FROM_PX
         for how in (NARROW, PLAIN, FAINT) if large else (PLAIN, NARROW, FAINT):
             if _sure(found):
                 break
-            outlines = find_outlines(view.gray, how)
+            outlines = _outlines(view, how)
             found += self.search(view, outlines)
             if not _sure(found):
                 found += self._search_relit(view, quads_of(outlines))
@@ -153,8 +153,8 @@ class Detector(Confirmer):
             missing = set(self.markers) - {seen.marker_id for seen in found}
             if not missing:
                 break
-            rest = replace(view, gray=_covered(view.gray, found))
-            outlines = find_outlines(rest.gray, how)
+            rest = replace(view, gray=_covered(view.gray, found), outlines={})
+            outlines = _outlines(rest, how)
             others = [*self.search(rest, outlines), *self._search_bent(rest, outlines)]
             found = surest([seen for seen in others if seen.marker_id in missing], first=found)
         return found
@@ -201,15 +201,15 @@ class Detector(Confirmer):
         """Return the markers bent about cylinders so much, or so far turned, that none was found otherwise."""
         if not self._bends:
             return []
-        fine = fine_outlines(view.gray) if view.gray.size <= HALVE_FROM_PX else find_outlines(view.gray, NARROW)
-        beside = bent_beside(view.some_camera, near_sides(view.gray))
+        fine = fine_outlines(view.gray) if view.gray.size <= HALVE_FROM_PX else _outlines(view, NARROW)
+        beside = bent_beside(view.some_camera, near_sides(_outlines(view, NARROW)))
         return self._search_bent(view, fine) or self._search_curved(view, beside)
 
     def _search_by_spline(self, view: View) -> list[Detection]:
         """Return the markers on surfaces that no cylinder explains."""
         if not self._bends:
             return []
-        bent = bent_quads_of(find_outlines(view.gray, PLAIN))
+        bent = bent_quads_of(_outlines(view, PLAIN))
         return surest(self._confirm_all(view, bent_candidates(view.gray, bent, self._codebook)))
 
     def _search_curved(self, view: View, bent: Bent) -> list[Detection]:
@@ -223,7 +223,7 @@ class Detector(Confirmer):
         """
         tried, left = np.zeros((0, 4, 2)), MAX_MATCHED
         for how in (TINY, BROAD, SLANTED, THIN, STEEP):
-            quads = quads_of(find_outlines(view.gray, how))
+            quads = quads_of(_outlines(view, how))
             found = self._search_relit(view, quads)
             if found:
                 return found
@@ -265,6 +265,13 @@ class Detector(Confirmer):
             if not _inside_any(candidate.corners_px, found) and tries.take(candidate):
                 take(candidate, self._confirm_aligned(view, candidate))
         return found + [seen for seen in surest(unmeasured) if not _inside_any(seen.corners_px, found)]
+
+
+def _outlines(view: View, how: Binarisation) -> Outlines:
+    """Return the outlines in an image, found once each way."""
+    if how not in view.outlines:
+        view.outlines[how] = find_outlines(view.gray, how)
+    return view.outlines[how]
 
 
 def _sure(found: Sequence[Detection]) -> bool:

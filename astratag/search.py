@@ -5,7 +5,9 @@ Pixels: (0, 0) is the centre of the top-left pixel.  Corners run clockwise in th
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import cv2
@@ -14,6 +16,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
+Contour = NDArray[np.int32]
+"""Pixels (N, 1, 2) along the border of a shape."""
 
 
 class Binarisation(NamedTuple):
@@ -71,22 +75,35 @@ OUTSET_PX, INSET_PX = 0.75, -0.5
 LEAST_SINE = 0.1
 
 
-class Outlines(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Outlines:
     """Plausible contours, the longest first, and what takes their coordinates to the whole image's pixels."""
 
-    contours: list[tuple[float, NDArray[np.int32]]]
+    contours: list[tuple[float, Contour]]
     scale: float
     origin: Array
     outset_px: float
     """How far out of the contour the square's edge lies, in the contour's own pixels."""
+    others: Sequence[Contour] = ()
+    """All contours, also those around holes, or too ragged or open for a square."""
 
     def moved(self, origin: Array) -> Outlines:
         """Return the outlines of a part of an image whose first pixel is at ``origin`` (2,)."""
-        return self._replace(origin=self.origin + origin)
+        return replace(self, origin=self.origin + origin)
 
     def in_image(self, points: Array) -> Array:
         """Return points (..., 2) of a contour in pixels of the image."""
         return self.scale * points + (self.scale - 1) / 2 + self.origin
+
+    @cached_property
+    def quads(self) -> Array:
+        """Return the quads (Q, 4, 2) that they may be when their sides are straight."""
+        return _quads(self, whole=False)
+
+    @cached_property
+    def bent_quads(self) -> BentQuads:
+        """Return what they may be when their sides bulge."""
+        return _bent_quads(self)
 
 
 class BentQuads(NamedTuple):
@@ -109,8 +126,9 @@ def find_outlines(gray: Image, how: Binarisation = PLAIN) -> Outlines:
     contours = () if noisy else cv2.findContours(shapes, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)[0]
     if how.holes:
         contours = [contour[::-1] for contour in contours]  # holes are run around the other way
-    found = sorted(_plausible(contours), key=lambda outline: -outline[0])[:MAX_CONTOURS]
-    return Outlines(found, 1 / how.scale, np.zeros(2), INSET_PX if how.holes else OUTSET_PX)
+    return Outlines(
+        _plausible(contours), 1 / how.scale, np.zeros(2), INSET_PX if how.holes else OUTSET_PX, others=contours
+    )
 
 
 def find_quads(gray: Image, how: Binarisation = PLAIN) -> Array:
@@ -123,6 +141,15 @@ def quads_of(outlines: Outlines, *, whole: bool = False) -> Array:
 
     ``whole`` leaves out outlines that are ragged, cut or covered: seldom squares, and long to look at.
     """
+    return _quads(outlines, whole=True) if whole else outlines.quads
+
+
+def bent_quads_of(outlines: Outlines) -> BentQuads:
+    """Return what outlines may be when their sides bulge: the four sharpest corners, and how they run between."""
+    return outlines.bent_quads
+
+
+def _quads(outlines: Outlines, *, whole: bool) -> Array:
     found = (_simplified(contour, perimeter, whole) for perimeter, contour in outlines.contours)
     quads = np.array([polygon for polygon in found if polygon is not None], dtype=float).reshape(-1, 4, 2)
     turned = _cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1]) < 0
@@ -131,8 +158,7 @@ def quads_of(outlines: Outlines, *, whole: bool = False) -> Array:
     return outlines.in_image(_grown(quads, outlines.outset_px))
 
 
-def bent_quads_of(outlines: Outlines) -> BentQuads:
-    """Return what outlines may be when their sides bulge: the four sharpest corners, and how they run between."""
+def _bent_quads(outlines: Outlines) -> BentQuads:
     contours, polygons = [], []
     for perimeter, contour in outlines.contours[:MAX_BENT_OUTLINES]:
         polygon = cv2.approxPolyDP(contour, BENT_TOLERANCE * perimeter, True)
@@ -150,15 +176,34 @@ def bent_quads_of(outlines: Outlines) -> BentQuads:
     return BentQuads(outlines.in_image(_grown(corners, outlines.outset_px)), outlines.scale * bulges)
 
 
-def _plausible(contours: Sequence[NDArray[np.int32]]) -> Iterator[tuple[float, NDArray[np.int32]]]:
-    """Yield perimeter and contour of those that run around ink, are long enough, and not too ragged for a square."""
-    for contour in contours:
-        if len(contour) >= 4:
-            area = -cv2.contourArea(contour, True)  # negative around ink, positive around holes in it
-            if area >= MIN_SIDE_PX**2:
-                perimeter = cv2.arcLength(contour, True)
-                if perimeter >= MIN_PERIMETER_PX and area >= LEAST_ROUNDNESS * perimeter**2:
-                    yield perimeter, contour
+def _plausible(contours: Sequence[Contour]) -> list[tuple[float, Contour]]:
+    """Return perimeters and contours, the longest first, of those that may be a square's: at most ``MAX_CONTOURS``.
+
+    They run around ink, are long enough, and not too ragged.
+    """
+    contours = [contour for contour in contours if len(contour) >= 4]
+    if not contours:
+        return []
+    area, perimeter = _sizes(contours)
+    use = (area >= MIN_SIDE_PX**2) & (perimeter >= MIN_PERIMETER_PX) & (area >= LEAST_ROUNDNESS * perimeter**2)
+    longest = np.flatnonzero(use)[np.argsort(-perimeter[use], kind="stable")[:MAX_CONTOURS]]
+    return [(float(perimeter[i]), contours[i]) for i in longest]
+
+
+def _sizes(contours: Sequence[Contour]) -> tuple[Array, Array]:
+    """Return the areas, negative of holes, and the perimeters (N,) of contours."""
+    starts = starts_of(contours)
+    points = np.concatenate(contours)[:, 0].astype(float)
+    after = np.roll(points, -1, axis=0)
+    after[np.append(starts[1:], len(points)) - 1] = points[starts]  # each contour ends where it began
+    area = np.add.reduceat(_cross(after, points), starts) / 2
+    return area, np.add.reduceat(np.sqrt(_squared(after - points)), starts)
+
+
+def starts_of(parts: Sequence[Contour]) -> NDArray[np.int64]:
+    """Return where each of several arrays (N,) begins once they are concatenated."""
+    lengths = np.fromiter(map(len, parts), np.int64, len(parts))
+    return np.cumsum(lengths) - lengths
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -179,7 +224,7 @@ def _grown(quads: Array, outset_px: float) -> Array:
     return quads + outset_px * (before - along) / np.maximum(_cross(before, along), LEAST_SINE)[..., None]
 
 
-def _simplified(contour: NDArray[np.int32], perimeter: float, whole: bool) -> NDArray[np.int32] | None:
+def _simplified(contour: Contour, perimeter: float, whole: bool) -> Contour | None:
     """Return the convex quad (4, 1, 2) that a contour simplifies to at the first tolerance that gives one.
 
     Else the one that its hull does, unless only a ``whole`` square will do.
@@ -195,7 +240,7 @@ def _simplified(contour: NDArray[np.int32], perimeter: float, whole: bool) -> ND
     return None
 
 
-def _sharpest(polygons: Sequence[NDArray[np.int32]]) -> tuple[Array, NDArray[np.bool_]]:
+def _sharpest(polygons: Sequence[Contour]) -> tuple[Array, NDArray[np.bool_]]:
     """Return the four vertices of each polygon (N, 1, 2) that turn most (B, 4, 2), and which turn enough (B,)."""
     lengths = np.array([len(polygon) for polygon in polygons])
     rows, column = np.arange(len(polygons))[:, None], np.arange(MAX_VERTICES)
@@ -209,7 +254,7 @@ def _sharpest(polygons: Sequence[NDArray[np.int32]]) -> tuple[Array, NDArray[np.
     return vertices[rows, np.sort(order, axis=1)], turn[rows[:, 0], order[:, 3]] >= LEAST_TURN
 
 
-def _bulging(contours: Sequence[NDArray[np.int32]], corners: Array) -> tuple[Array, Array]:
+def _bulging(contours: Sequence[Contour], corners: Array) -> tuple[Array, Array]:
     """Return four corners (B, 4, 2) on each contour, and the bulges (B, 4, 2) of the sides between, as parabolas."""
     points = np.concatenate(contours)[:, 0].astype(float)
     lengths = np.array([len(contour) for contour in contours])
