@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
 import cv2
@@ -27,7 +26,7 @@ from astratag.geometry import (
 )
 from astratag.grow import ALL_EDGES, Fit, Light, layer_side_px, settle
 from astratag.neighbours import Crossings
-from astratag.search import Binarisation, Contour, Outlines, find_outlines, starts_of
+from astratag.search import Contour, Outlines, starts_of
 from astratag.signature import SAMPLES, Artwork, Codebook, Warp, cell_values, layer_cells, sample, unit
 from astratag.warp import OUTSIDE_PX, FittedWarp
 
@@ -45,7 +44,6 @@ LEAST_TURN_RAD, LEAST_ALIKE = 0.4, 0.5
 """How sharp its two corners must be, and how parallel (as a cosine) the sides beside it."""
 NEAR_TOLERANCE_PX, NEAR_OUTSET_PX = 1.5, 0.4
 MAX_NEAR = 24
-FINE = Binarisation(smooth_px=1, window_px=11)
 SAME_SQUARE = 0.1
 """Squares whose centres and sizes differ by less than this fraction are one."""
 UNCLEAR = 0.2
@@ -74,12 +72,6 @@ CLEAR_BEND = 5.0
 MOVES, DAMPING = 8, 0.03
 """Damped Gauss-Newton steps from a plane through a bent square's corners onto the square."""
 _CELL_MIDDLES = cell_polygons().mean(axis=1)
-
-
-def fine_outlines(gray: Image) -> Outlines:
-    """Return the outlines of dark shapes at twice the resolution: rings about to close where the print turns away."""
-    twice = cv2.resize(gray, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
-    return replace(find_outlines(twice, FINE), scale=0.5)
 
 
 def near_sides(outlines: Outlines) -> Array:
@@ -128,7 +120,7 @@ def _near_sides(polygons: Sequence[Contour], scale: float) -> Array:
 def curved_candidates(gray: Image, bent: Bent, codebook: Codebook) -> list[Candidate]:
     """Return what bent squares read, the best about each place, the best first."""
     at = bent.all
-    at = at[darker_inside(sample(gray, bent.project(FRAME, at)))][:MAX_READ] if len(at) else at
+    at = at[darker_inside(sample(gray, bent.project(FRAME)))][:MAX_READ] if len(at) else at
     if len(at) == 0:
         return []
     cells, facing = cell_values(gray, bent.project(SAMPLES, at)), bent.facing(_CELL_MIDDLES, at)

@@ -21,17 +21,14 @@ from astratag.candidates import (
     bent_candidates,
     flat_candidates,
     framed,
+    looks_large,
     relit_candidates,
 )
 from astratag.checks import instance
 from astratag.codes.acceptance import FALSE_ACCEPT_RATE, chance_of_correlation
 from astratag.codes.soft import CREDIBLE
 from astratag.confirm import Confirmer
-from astratag.curved import (
-    curved_candidates,
-    fine_outlines,
-    near_sides,
-)
+from astratag.curved import LEAST_SIDE_PX, curved_candidates, near_sides
 from astratag.cylinder import Bent, CylinderWarp, bent_beside, bent_through
 from astratag.describe import PIXEL_BLUR, MarkerSpec
 from astratag.detection import Detection
@@ -54,6 +51,7 @@ from astratag.search import (
     bent_quads_of,
     find_outlines,
     quads_of,
+    scaled,
 )
 from astratag.signature import EFFECTIVE_SHARE
 from astratag.surface import Flat, Surface
@@ -153,7 +151,7 @@ class Detector(Confirmer):
             missing = set(self.markers) - {seen.marker_id for seen in found}
             if not missing:
                 break
-            rest = replace(view, gray=_covered(view.gray, found), outlines={})
+            rest = replace(view, gray=_covered(view.gray, found), scaled={}, outlines={})
             outlines = _outlines(rest, how)
             others = [*self.search(rest, outlines), *self._search_bent(rest, outlines)]
             found = surest([seen for seen in others if seen.marker_id in missing], first=found)
@@ -195,15 +193,15 @@ class Detector(Confirmer):
         if not self._bends:
             return []
         quads = np.concatenate([quads_of(outlines), bent_quads_of(outlines).corners_px])
+        quads = quads[looks_large(quads) >= LEAST_SIDE_PX]
         return self._search_curved(view, bent_through(view.some_camera, quads))
 
     def _search_very_bent(self, view: View) -> list[Detection]:
         """Return the markers bent about cylinders so much, or so far turned, that none was found otherwise."""
         if not self._bends:
             return []
-        fine = fine_outlines(view.gray) if view.gray.size <= HALVE_FROM_PX else _outlines(view, NARROW)
         beside = bent_beside(view.some_camera, near_sides(_outlines(view, NARROW)))
-        return self._search_bent(view, fine) or self._search_curved(view, beside)
+        return self._search_bent(view, _outlines(view, THIN)) or self._search_curved(view, beside)
 
     def _search_by_spline(self, view: View) -> list[Detection]:
         """Return the markers on surfaces that no cylinder explains."""
@@ -270,7 +268,9 @@ class Detector(Confirmer):
 def _outlines(view: View, how: Binarisation) -> Outlines:
     """Return the outlines in an image, found once each way."""
     if how not in view.outlines:
-        view.outlines[how] = find_outlines(view.gray, how)
+        if how.scale not in view.scaled:
+            view.scaled[how.scale] = scaled(view.gray, how.scale)
+        view.outlines[how] = find_outlines(view.gray, how, view.scaled[how.scale])
     return view.outlines[how]
 
 
