@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import hypot
 from typing import NamedTuple
 
 import cv2
@@ -65,6 +66,8 @@ POLYGON_TOLERANCES = (0.03, 0.05, 0.015, 0.08)
 """Fractions of the perimeter, most useful first; skinny quads need the small ones, bent squares the large."""
 WHOLE_TOLERANCES = 2
 """How many of them a square needs that is whole, not very skinny, and not very bent."""
+TOLERANCES_A_SIDE = 5.0
+"""How many times the tolerance the shortest side must be, or corners are moved by too much of it."""
 BENT_TOLERANCE = 0.015
 MAX_VERTICES = 16
 LEAST_TURN = 0.2
@@ -289,19 +292,29 @@ def _grown(quads: Array, outset_px: float) -> Array:
 
 
 def _simplified(contour: Contour, perimeter: float, whole: bool) -> Contour | None:
-    """Return the convex quad (4, 1, 2) that a contour simplifies to at the first tolerance that gives one.
+    """Return the convex quad (4, 1, 2) that a contour simplifies to at the first tolerance that its sides bear.
 
-    Else the one that its hull does, unless only a ``whole`` square will do.
+    One not much smaller than a skinny quad's short sides moves its corners along the long ones.  Else the quad of the
+    finest tolerance that gives one, else its hull's, unless only a ``whole`` square will do.
     """
+    finest, quad = np.inf, None
     for tolerance in POLYGON_TOLERANCES[: WHOLE_TOLERANCES if whole else None]:
         polygon = cv2.approxPolyDP(contour, tolerance * perimeter, True)
         if len(polygon) == 4 and cv2.isContourConvex(polygon):
-            return polygon
-    if not whole:
+            if whole or _shortest(polygon) >= TOLERANCES_A_SIDE * tolerance * perimeter:
+                return polygon
+            finest, quad = min((finest, quad), (tolerance, polygon), key=lambda found: found[0])
+    if quad is None and not whole:
         hull = cv2.convexHull(contour)
         if 4 <= len(hull) < len(contour):
             return _simplified(hull, cv2.arcLength(hull, True), False)
-    return None
+    return quad
+
+
+def _shortest(polygon: Contour) -> float:
+    """Return how long the shortest side of a quad (4, 1, 2) is."""
+    (ax, ay), (bx, by), (cx, cy), (dx, dy) = polygon[:, 0].tolist()
+    return min(hypot(bx - ax, by - ay), hypot(cx - bx, cy - by), hypot(dx - cx, dy - cy), hypot(ax - dx, ay - dy))
 
 
 def _cut(outlines: Outlines) -> NDArray[np.bool_]:
