@@ -142,7 +142,7 @@ def scaled(gray: Image, scale: float) -> Scaled:
     """Return an image at another resolution; of one that is enlarged, only the best parts are worth looking at."""
     if scale == 1.0:
         return Scaled(gray)
-    interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     other = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=interpolation)
     worth = _worth_a_fine_look(gray) if scale > 1 else None
     if worth is not None:
