@@ -61,7 +61,7 @@ LIKELY_ANOTHER, CHANCE_OF_BOTH = 1e-2, 1e-8
 
 The latter a hundredth of what is asked of one square read once: an alignment fits cells a little, too.
 """
-MOVED_PX, MOVED = 4.0, 0.2
+MOVED_PX, MOVED = 4.0, 0.3
 """How far an alignment may move corners: pixels, or a fraction of the square's side if that is more."""
 WHOLE_HALF_ANGLES_RAD = (0.08, 0.2, 0.33, 0.5, 0.7, 0.9)
 """How far a whole print may bend to either side of its middle: radii of 6 to 0.55 sides."""
@@ -193,16 +193,25 @@ def _aligned(
 ) -> CylinderWarp | None:
     """Return a square moved until what is in view of it looks like a layer of the marker it reads as; None if hopeless.
 
-    The first steps are taken on a coarser grid of points, which does as well on a blurred picture.
+    The first steps are taken on a coarser grid of points, which does as well on a blurred picture.  Where a blur makes
+    one of much that is seen at a slant they lead astray, and are taken back.
     """
     expected, points = artwork.expected(reading.marker_id, side_px)[layer], artwork.points
     coarse = np.arange(len(points)).reshape(artwork.GRID, -1)[::2, ::2].ravel()
+
+    def looks(warp: CylinderWarp) -> float:
+        return float(artwork.layer_scores(gray, facing(warp), reading.marker_id, side_px)[layer])
+
+    before = looks(warp)
     for blur, steps, among in ((COARSE_BLUR, COARSE_STEPS, coarse), (0.0, FINE_STEPS, np.arange(len(points)))):
         seen = among[warp.visible(points[among])]
         if len(seen) < LEAST_IN_VIEW * len(among):
             return None
-        warp = align(gray, warp, points[seen], expected[seen], blur=blur, steps=steps)
-        if blur > 0 and artwork.layer_scores(gray, facing(warp), reading.marker_id, side_px)[layer] < HOPELESS_LOOKS:
+        moved = align(gray, warp, points[seen], expected[seen], blur=blur, steps=steps)
+        after = looks(moved)
+        if after >= before:
+            warp, before = moved, after
+        if before < HOPELESS_LOOKS:
             return None
     return warp
 

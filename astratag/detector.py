@@ -192,7 +192,12 @@ class Detector(Confirmer):
         """Return the markers among outlines bent about cylinders, none when every marker is on a plane."""
         if not self._bends:
             return []
-        quads = np.concatenate([quads_of(outlines), bent_quads_of(outlines).corners_px])
+        return self._search_bent_about(view, np.concatenate([quads_of(outlines), bent_quads_of(outlines).corners_px]))
+
+    def _search_bent_about(self, view: View, quads: Array) -> list[Detection]:
+        """Return the markers among squares bent about cylinders whose corners are those of quads (Q, 4, 2)."""
+        if not self._bends:
+            return []
         quads = quads[looks_large(quads) >= LEAST_SIDE_PX]
         return self._search_curved(view, bent_through(view.some_camera, quads))
 
@@ -217,7 +222,7 @@ class Detector(Confirmer):
     def _search_pixels(self, view: View) -> list[Detection]:
         """Return the markers whose edges or cells cannot be followed, by all their pixels; see ``matching``.
 
-        Those in uneven light are read cell by cell.
+        Those in uneven light are read cell by cell; and bent squares that none was found through by then.
         """
         tried, left = np.zeros((0, 4, 2)), MAX_MATCHED
         for how in (TINY, BROAD, SLANTED, THIN, STEEP):
@@ -230,9 +235,11 @@ class Detector(Confirmer):
             rough = rough_matches(self._synthesis, view.light, fresh, PIXEL_BLUR)[:left]
             left -= len(rough)
             found = [seen for seen in (self._confirm_pixels(view, one) for one in rough) if seen is not None]
-            if found or left == 0:
+            if found:
                 return found
-        return []
+            if left == 0:
+                break
+        return self._search_bent_about(view, tried)
 
     @property
     def _bends(self) -> bool:
