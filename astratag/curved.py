@@ -26,7 +26,7 @@ from astratag.geometry import (
 )
 from astratag.grow import ALL_EDGES, Fit, Light, layer_side_px, settle
 from astratag.neighbours import Crossings
-from astratag.search import NARROW, Binarisation, Outlines, find_outlines
+from astratag.search import Contour, Outlines, starts_of
 from astratag.signature import SAMPLES, Artwork, Codebook, Warp, cell_values, layer_cells, sample, unit
 from astratag.warp import OUTSIDE_PX, FittedWarp
 
@@ -44,7 +44,6 @@ LEAST_TURN_RAD, LEAST_ALIKE = 0.4, 0.5
 """How sharp its two corners must be, and how parallel (as a cosine) the sides beside it."""
 NEAR_TOLERANCE_PX, NEAR_OUTSET_PX = 1.5, 0.4
 MAX_NEAR = 24
-FINE = Binarisation(smooth_px=1, window_px=11)
 SAME_SQUARE = 0.1
 """Squares whose centres and sizes differ by less than this fraction are one."""
 UNCLEAR = 0.2
@@ -62,7 +61,7 @@ LIKELY_ANOTHER, CHANCE_OF_BOTH = 1e-2, 1e-8
 
 The latter a hundredth of what is asked of one square read once: an alignment fits cells a little, too.
 """
-MOVED_PX, MOVED = 4.0, 0.2
+MOVED_PX, MOVED = 4.0, 0.3
 """How far an alignment may move corners: pixels, or a fraction of the square's side if that is more."""
 WHOLE_HALF_ANGLES_RAD = (0.08, 0.2, 0.33, 0.5, 0.7, 0.9)
 """How far a whole print may bend to either side of its middle: radii of 6 to 0.55 sides."""
@@ -75,51 +74,53 @@ MOVES, DAMPING = 8, 0.03
 _CELL_MIDDLES = cell_polygons().mean(axis=1)
 
 
-def fine_outlines(gray: Image) -> Outlines:
-    """Return the outlines of dark shapes at twice the resolution: rings about to close where the print turns away."""
-    twice = cv2.resize(gray, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
-    return find_outlines(twice, FINE)._replace(scale=0.5)
-
-
-def near_sides(gray: Image) -> Array:
+def near_sides(outlines: Outlines) -> Array:
     """Return sides (Q, 2, 2) of dark shapes that may be a square's, clockwise, however its other sides go on.
 
     The far side of a print may lie at the limb, or its ink run into what is dark behind it.  Both corners of the near
     side are seen, and how the sides beside it begin.
     """
-    ink = cv2.adaptiveThreshold(
-        gray, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, NARROW.window_px, NARROW.offset
-    )
-    found: list[Array] = []
-    for contour in cv2.findContours(ink, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)[0]:
-        if len(contour) >= 4 and max(cv2.boundingRect(contour)[2:]) >= LEAST_NEAR_PX:
-            polygon = cv2.approxPolyDP(contour, NEAR_TOLERANCE_PX, True)[::-1, 0].astype(float)
-            if len(polygon) >= 4:
-                found += _near_sides(polygon)
-    found.sort(key=lambda side: -float(np.linalg.norm(side[1] - side[0])))
-    return np.array(found[:MAX_NEAR]).reshape(-1, 2, 2)
+    contours = [contour for contour in outlines.others if len(contour) >= 4]
+    if not contours:
+        return np.zeros((0, 2, 2))
+    points, starts = np.concatenate(contours)[:, 0], starts_of(contours)
+    extent = np.maximum.reduceat(points, starts) - np.minimum.reduceat(points, starts)
+    large = np.flatnonzero(extent.max(axis=1) >= LEAST_NEAR_PX / outlines.scale)
+    polygons = [cv2.approxPolyDP(contours[i], NEAR_TOLERANCE_PX / outlines.scale, True)[::-1] for i in large]
+    sides = _near_sides([polygon for polygon in polygons if len(polygon) >= 4], outlines.scale)
+    return outlines.in_image(sides)
 
 
-def _near_sides(polygon: Array) -> list[Array]:
-    """Return the long sides (2, 2) of a clockwise polygon (N, 2) that lie between two corners."""
-    ahead = np.roll(polygon, -1, axis=0) - polygon
-    length = np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)
+def _near_sides(polygons: Sequence[Contour], scale: float) -> Array:
+    """Return the long sides (Q, 2, 2) of clockwise polygons (N, 1, 2) that lie between two corners, the longest first.
+
+    ``scale`` is how many pixels of the image theirs are wide.
+    """
+    if not polygons:
+        return np.zeros((0, 2, 2))
+    starts, at = starts_of(polygons), np.concatenate(polygons)[:, 0].astype(float)
+    next_one, last_one = np.arange(len(at)) + 1, np.arange(len(at)) - 1
+    ends = np.append(starts[1:], len(at)) - 1
+    next_one[ends], last_one[starts] = starts, ends
+    ahead = at[next_one] - at
+    length = np.maximum(np.sqrt((ahead * ahead).sum(axis=1)), 1e-9)
     along = ahead / length[:, None]
-    before, after = np.roll(along, 1, axis=0), np.roll(along, -1, axis=0)
+    before, after = along[last_one], along[next_one]
     turn = np.arctan2(before[:, 0] * along[:, 1] - before[:, 1] * along[:, 0], (before * along).sum(axis=1))
     corner = (turn > LEAST_TURN_RAD) & (turn < np.pi - LEAST_TURN_RAD)
-    beside = np.minimum(np.roll(length, 1), np.roll(length, -1))
+    beside = scale * np.minimum(length[last_one], length[next_one])
     alike = -(before * after).sum(axis=1) > LEAST_ALIKE
-    use = corner & np.roll(corner, -1) & (length >= LEAST_NEAR_PX) & (beside >= LEAST_BESIDE_PX) & alike
+    use = corner & corner[next_one] & (scale * length >= LEAST_NEAR_PX) & (beside >= LEAST_BESIDE_PX) & alike
+    longest = np.flatnonzero(use)[np.argsort(-length[use], kind="stable")[:MAX_NEAR]]
     outward = np.stack([along[:, 1], -along[:, 0]], axis=1)
-    outset_px = NEAR_OUTSET_PX * np.stack([outward - along, outward + along], axis=1)
-    return list((np.stack([polygon, np.roll(polygon, -1, axis=0)], axis=1) + outset_px)[use])
+    outset = NEAR_OUTSET_PX / scale * np.stack([outward - along, outward + along], axis=1)
+    return (np.stack([at, at[next_one]], axis=1) + outset)[longest]
 
 
 def curved_candidates(gray: Image, bent: Bent, codebook: Codebook) -> list[Candidate]:
     """Return what bent squares read, the best about each place, the best first."""
     at = bent.all
-    at = at[darker_inside(sample(gray, bent.project(FRAME, at)))][:MAX_READ] if len(at) else at
+    at = at[darker_inside(sample(gray, bent.project(FRAME)))][:MAX_READ] if len(at) else at
     if len(at) == 0:
         return []
     cells, facing = cell_values(gray, bent.project(SAMPLES, at)), bent.facing(_CELL_MIDDLES, at)
@@ -192,16 +193,25 @@ def _aligned(
 ) -> CylinderWarp | None:
     """Return a square moved until what is in view of it looks like a layer of the marker it reads as; None if hopeless.
 
-    The first steps are taken on a coarser grid of points, which does as well on a blurred picture.
+    The first steps are taken on a coarser grid of points, which does as well on a blurred picture.  Where a blur makes
+    one of much that is seen at a slant they lead astray, and are taken back.
     """
     expected, points = artwork.expected(reading.marker_id, side_px)[layer], artwork.points
     coarse = np.arange(len(points)).reshape(artwork.GRID, -1)[::2, ::2].ravel()
+
+    def looks(warp: CylinderWarp) -> float:
+        return float(artwork.layer_scores(gray, facing(warp), reading.marker_id, side_px)[layer])
+
+    before = looks(warp)
     for blur, steps, among in ((COARSE_BLUR, COARSE_STEPS, coarse), (0.0, FINE_STEPS, np.arange(len(points)))):
         seen = among[warp.visible(points[among])]
         if len(seen) < LEAST_IN_VIEW * len(among):
             return None
-        warp = align(gray, warp, points[seen], expected[seen], blur=blur, steps=steps)
-        if blur > 0 and artwork.layer_scores(gray, facing(warp), reading.marker_id, side_px)[layer] < HOPELESS_LOOKS:
+        moved = align(gray, warp, points[seen], expected[seen], blur=blur, steps=steps)
+        after = looks(moved)
+        if after >= before:
+            warp, before = moved, after
+        if before < HOPELESS_LOOKS:
             return None
     return warp
 

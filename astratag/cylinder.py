@@ -166,25 +166,31 @@ class Bent:
         T = pose(self.rotation[place, model], self.translation[place, model])
         return CylinderWarp.of(self.camera, 1.0, self.curvature[model], self.axis_rad[model], T)
 
-    def project(self, template: Array, which: NDArray[np.int64]) -> Array:
-        """Return where template points (S, 2) lie in the image (N, S, 2) for those ``which`` (N, 2)."""
-        points_cam = self._cam(template, which)[0]
-        points_cam[..., 2] = np.maximum(points_cam[..., 2], 1e-3)
-        return self.camera.project(points_cam.reshape(-1, 3)).reshape(*points_cam.shape[:2], 2)
+    def project(self, template: Array, which: NDArray[np.int64] | None = None) -> Array:
+        """Return where template points (S, 2) lie in the image (N, S, 2) for those ``which`` (N, 2), or for ``all``."""
+        on_print = print_from_template(template, 1.0)
+        points = np.stack([surface.points(on_print) for surface in self._surfaces]).swapaxes(1, 2)  # (M, 3, S)
+        if which is None:
+            points_cam = (self.rotation @ points + self.translation[..., None]).reshape(-1, 3, len(template))
+        else:
+            place, model = which.T
+            points_cam = self.rotation[place, model] @ points[model] + self.translation[place, model, :, None]
+        points_cam[:, 2] = np.maximum(points_cam[:, 2], 1e-3)
+        return self.camera.project(points_cam.swapaxes(1, 2).reshape(-1, 3)).reshape(-1, len(template), 2)
 
     def facing(self, template: Array, which: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which template points (N, S) face the viewer by more than a grazing angle."""
-        points_cam, normals_cam = self._cam(template, which)
-        return -(points_cam * normals_cam).sum(axis=2) > GRAZING_COSINE * np.linalg.norm(points_cam, axis=2)
-
-    def _cam(self, template: Array, which: NDArray[np.int64]) -> tuple[Array, Array]:
-        """Return points and outward normals (N, S, 3) in the camera frame."""
         on_print = print_from_template(template, 1.0)
-        surfaces = [Cylinder(1 / k, axis) for k, axis in zip(self.curvature, self.axis_rad, strict=True)]
-        points, normals = (np.stack([getattr(s, of)(on_print) for s in surfaces]) for of in ("points", "normals"))
+        points = np.stack([surface.points(on_print) for surface in self._surfaces])
+        normals = np.stack([surface.normals(on_print) for surface in self._surfaces])
         place, model = which.T
-        turn = self.rotation[place, model].swapaxes(-1, -2)
-        return points[model] @ turn + self.translation[place, model, None], normals[model] @ turn
+        eye = -self.translation[place, model, None] @ self.rotation[place, model]  # where the print sees the camera
+        towards, normals = eye - points[model], normals[model]
+        return (towards * normals).sum(axis=2) > GRAZING_COSINE * np.sqrt((towards * towards).sum(axis=2))
+
+    @property
+    def _surfaces(self) -> list[Cylinder]:
+        return [Cylinder(1 / k, axis) for k, axis in zip(self.curvature, self.axis_rad, strict=True)]
 
 
 def bent_through(camera: Camera, quads: Array, half_angles_rad: tuple[float, ...] = HALF_ANGLES_RAD) -> Bent:

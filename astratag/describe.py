@@ -17,6 +17,7 @@ from astratag.candidates import (
 )
 from astratag.checks import instance, positive
 from astratag.codes.acceptance import FALSE_ACCEPT_RATE
+from astratag.curved import cells_in_view
 from astratag.cylinder import CylinderWarp
 from astratag.detection import Detection, LayerDetection, PlanarPose
 from astratag.dictionary import Dictionary, load_dictionary
@@ -28,7 +29,7 @@ from astratag.matching import INDEPENDENT_CELLS, acceptance_of_pixels
 from astratag.neighbours import Crossings, crossings
 from astratag.pose import planar_poses, refine_on_corners
 from astratag.relight import RELIT_SAMPLES, relit_layer
-from astratag.signature import Artwork, Codebook, Reading, layer_cells
+from astratag.signature import LEAST_SEEN, Artwork, Codebook, Reading, layer_cells
 from astratag.surface import Cylinder, Flat, Surface
 from astratag.synthesis import Alignment, Synthesis
 from astratag.transforms import difference
@@ -235,23 +236,42 @@ class Describer:
     def _read_through(self, view: View, warp: FittedWarp, marker_id: int, relit: bool) -> Reading | None:
         """Return the surest reading of one identity among the layers whose cells are all in the image.
 
-        The larger layers come first, and one that is sure will do.
+        The larger layers come first, and one that is sure will do.  Where the image's border cuts all of them, those
+        of which enough cells are in it.
         """
         best: Reading | None = None
-        for layer, corners in zip(LAYERS, warp(CELLS_WITHIN), strict=True):
-            if inside(corners, view.gray.shape):
-                reading = self._read_layer(view, warp, layer.index, marker_id, relit)
+        whole = [inside(corners, view.gray.shape) for corners in warp(CELLS_WITHIN)]
+        for layer in LAYERS:
+            seen = None
+            if not any(whole):
+                seen = cells_in_view(warp, layer.index, view.gray.shape)
+            if whole[layer.index] or (seen is not None and seen.sum() >= LEAST_SEEN):
+                reading = self._read_layer(view, warp, layer.index, marker_id, relit, seen)
                 best = reading if best is None else max(best, reading, key=self._codebook.excess)
                 if best.correlation >= SURE:
                     break
         return best
 
-    def _read_layer(self, view: View, warp: FittedWarp, layer: int, marker_id: int, relit: bool) -> Reading:
-        """Return how well one layer reads as a marker, through a warp of the print; in even light, or ``relit``."""
+    def _read_layer(
+        self,
+        view: View,
+        warp: FittedWarp,
+        layer: int,
+        marker_id: int,
+        relit: bool,
+        among: NDArray[np.bool_] | None = None,
+    ) -> Reading:
+        """Return how well one layer reads as a marker, through a warp of the print; in even light, or ``relit``.
+
+        Only ``among`` (48,) of its cells when these are given.
+        """
         if relit:
             cells, seen = relit_layer(view.light, warp, layer_points(RELIT_SAMPLES, LAYERS[layer]))
-            return self._codebook.read_seen_as(cells, seen, marker_id)
-        return self._codebook.read_as(layer_cells(view.light, warp, layer), marker_id)
+            return self._codebook.read_seen_as(cells, seen if among is None else seen & among, marker_id)
+        cells = layer_cells(view.light, warp, layer)
+        if among is None:
+            return self._codebook.read_as(cells, marker_id)
+        return self._codebook.read_seen_as(cells, among, marker_id)
 
 
 def _listed(markers: Mapping[int, MarkerSpec] | None, dictionary: Dictionary) -> dict[int, MarkerSpec]:

@@ -21,17 +21,14 @@ from astratag.candidates import (
     bent_candidates,
     flat_candidates,
     framed,
+    looks_large,
     relit_candidates,
 )
 from astratag.checks import instance
 from astratag.codes.acceptance import FALSE_ACCEPT_RATE, chance_of_correlation
 from astratag.codes.soft import CREDIBLE
 from astratag.confirm import Confirmer
-from astratag.curved import (
-    curved_candidates,
-    fine_outlines,
-    near_sides,
-)
+from astratag.curved import LEAST_SIDE_PX, curved_candidates, near_sides
 from astratag.cylinder import Bent, CylinderWarp, bent_beside, bent_through
 from astratag.describe import PIXEL_BLUR, MarkerSpec
 from astratag.detection import Detection
@@ -54,6 +51,7 @@ from astratag.search import (
     bent_quads_of,
     find_outlines,
     quads_of,
+    scaled,
 )
 from astratag.signature import EFFECTIVE_SHARE
 from astratag.surface import Flat, Surface
@@ -123,12 +121,12 @@ class Detector(Confirmer):
         """
         if min(view.gray.shape) < LEAST_IMAGE_PX:
             return []
-        found = self.search(view, find_outlines(view.gray, COARSE), whole=True)
+        found = self.search(view, _outlines(view, COARSE), whole=True)
         large = view.gray.size > HALVE_FROM_PX
         for how in (NARROW, PLAIN, FAINT) if large else (PLAIN, NARROW, FAINT):
             if _sure(found):
                 break
-            outlines = find_outlines(view.gray, how)
+            outlines = _outlines(view, how)
             found += self.search(view, outlines)
             if not _sure(found):
                 found += self._search_relit(view, quads_of(outlines))
@@ -153,8 +151,8 @@ class Detector(Confirmer):
             missing = set(self.markers) - {seen.marker_id for seen in found}
             if not missing:
                 break
-            rest = replace(view, gray=_covered(view.gray, found))
-            outlines = find_outlines(rest.gray, how)
+            rest = replace(view, gray=_covered(view.gray, found), scaled={}, outlines={})
+            outlines = _outlines(rest, how)
             others = [*self.search(rest, outlines), *self._search_bent(rest, outlines)]
             found = surest([seen for seen in others if seen.marker_id in missing], first=found)
         return found
@@ -194,22 +192,27 @@ class Detector(Confirmer):
         """Return the markers among outlines bent about cylinders, none when every marker is on a plane."""
         if not self._bends:
             return []
-        quads = np.concatenate([quads_of(outlines), bent_quads_of(outlines).corners_px])
+        return self._search_bent_about(view, np.concatenate([quads_of(outlines), bent_quads_of(outlines).corners_px]))
+
+    def _search_bent_about(self, view: View, quads: Array) -> list[Detection]:
+        """Return the markers among squares bent about cylinders whose corners are those of quads (Q, 4, 2)."""
+        if not self._bends:
+            return []
+        quads = quads[looks_large(quads) >= LEAST_SIDE_PX]
         return self._search_curved(view, bent_through(view.some_camera, quads))
 
     def _search_very_bent(self, view: View) -> list[Detection]:
         """Return the markers bent about cylinders so much, or so far turned, that none was found otherwise."""
         if not self._bends:
             return []
-        fine = fine_outlines(view.gray) if view.gray.size <= HALVE_FROM_PX else find_outlines(view.gray, NARROW)
-        beside = bent_beside(view.some_camera, near_sides(view.gray))
-        return self._search_bent(view, fine) or self._search_curved(view, beside)
+        beside = bent_beside(view.some_camera, near_sides(_outlines(view, NARROW)))
+        return self._search_bent(view, _outlines(view, THIN)) or self._search_curved(view, beside)
 
     def _search_by_spline(self, view: View) -> list[Detection]:
         """Return the markers on surfaces that no cylinder explains."""
         if not self._bends:
             return []
-        bent = bent_quads_of(find_outlines(view.gray, PLAIN))
+        bent = bent_quads_of(_outlines(view, PLAIN))
         return surest(self._confirm_all(view, bent_candidates(view.gray, bent, self._codebook)))
 
     def _search_curved(self, view: View, bent: Bent) -> list[Detection]:
@@ -219,11 +222,11 @@ class Detector(Confirmer):
     def _search_pixels(self, view: View) -> list[Detection]:
         """Return the markers whose edges or cells cannot be followed, by all their pixels; see ``matching``.
 
-        Those in uneven light are read cell by cell.
+        Those in uneven light are read cell by cell; and bent squares that none was found through by then.
         """
         tried, left = np.zeros((0, 4, 2)), MAX_MATCHED
         for how in (TINY, BROAD, SLANTED, THIN, STEEP):
-            quads = quads_of(find_outlines(view.gray, how))
+            quads = quads_of(_outlines(view, how))
             found = self._search_relit(view, quads)
             if found:
                 return found
@@ -232,9 +235,11 @@ class Detector(Confirmer):
             rough = rough_matches(self._synthesis, view.light, fresh, PIXEL_BLUR)[:left]
             left -= len(rough)
             found = [seen for seen in (self._confirm_pixels(view, one) for one in rough) if seen is not None]
-            if found or left == 0:
+            if found:
                 return found
-        return []
+            if left == 0:
+                break
+        return self._search_bent_about(view, tried)
 
     @property
     def _bends(self) -> bool:
@@ -265,6 +270,15 @@ class Detector(Confirmer):
             if not _inside_any(candidate.corners_px, found) and tries.take(candidate):
                 take(candidate, self._confirm_aligned(view, candidate))
         return found + [seen for seen in surest(unmeasured) if not _inside_any(seen.corners_px, found)]
+
+
+def _outlines(view: View, how: Binarisation) -> Outlines:
+    """Return the outlines in an image, found once each way."""
+    if how not in view.outlines:
+        if how.scale not in view.scaled:
+            view.scaled[how.scale] = scaled(view.gray, how.scale)
+        view.outlines[how] = find_outlines(view.gray, how, view.scaled[how.scale])
+    return view.outlines[how]
 
 
 def _sure(found: Sequence[Detection]) -> bool:

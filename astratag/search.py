@@ -5,7 +5,10 @@ Pixels: (0, 0) is the centre of the top-left pixel.  Corners run clockwise in th
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import hypot
 from typing import NamedTuple
 
 import cv2
@@ -14,6 +17,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
+Contour = NDArray[np.int32]
+"""Pixels (N, 1, 2) along the border of a shape."""
 
 
 class Binarisation(NamedTuple):
@@ -46,13 +51,23 @@ TINY = Binarisation(scale=2.0, smooth_px=1, window_px=9, holes=True)
 SLANTED = Binarisation(scale=2.0, smooth_px=1, window_px=21, offset=15, holes=True)
 STEEP = Binarisation(scale=2.0, smooth_px=1, window_px=31, offset=20, holes=True)
 """For margins a pixel wide, of squares seen at more than 80 degrees."""
-THIN = Binarisation(scale=2.0, smooth_px=1, window_px=9)
-"""For borders a pixel wide."""
+THIN = Binarisation(scale=2.0, smooth_px=1, window_px=11)
+"""For borders a pixel wide, and rings about to close where a print turns away."""
+
+BLOCK_PX, STEP_PX = 16, 5
+"""Where an image is worth twice its resolution is decided in blocks, by the largest step of brightness in each."""
+FINE_PX = 80_000
+"""How much of an image is looked at that closely, in its own pixels, the largest steps first.
+
+Paper and ink make the largest: what was found so filled at most a tenth of 640x480, and a fourth among sharp clutter.
+"""
 
 POLYGON_TOLERANCES = (0.03, 0.05, 0.015, 0.08)
 """Fractions of the perimeter, most useful first; skinny quads need the small ones, bent squares the large."""
 WHOLE_TOLERANCES = 2
 """How many of them a square needs that is whole, not very skinny, and not very bent."""
+TOLERANCES_A_SIDE = 5.0
+"""How many times the tolerance the shortest side must be, or corners are moved by too much of it."""
 BENT_TOLERANCE = 0.015
 MAX_VERTICES = 16
 LEAST_TURN = 0.2
@@ -62,31 +77,51 @@ MIN_PERIMETER_PX = 24.0
 MIN_SIDE_PX = 3.0
 LEAST_ROUNDNESS = 0.009
 """Area over squared perimeter: 0.0625 of a square, 0.03 of one seen at 80 degrees, less of ragged shapes."""
-NOISE = 0.3
-"""Share of pixels that are ink where their neighbour is not, or the reverse, from which a picture is noise."""
+NOISE = 0.2
+"""Share of pixels that are ink where their neighbour is not, or the reverse, from which a picture is noise.
+
+Of its own pixels: enlarged twice, half as many change.
+"""
 MAX_CONTOURS = 500
 MAX_BENT_OUTLINES = 120
 OUTSET_PX, INSET_PX = 0.75, -0.5
 """Contours run through the centres of the outermost ink pixels, or of the white pixels beside a hole."""
 LEAST_SINE = 0.1
+BORDER_PX = 1
+"""Outlines this near to the image's border are cut by it."""
 
 
-class Outlines(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Outlines:
     """Plausible contours, the longest first, and what takes their coordinates to the whole image's pixels."""
 
-    contours: list[tuple[float, NDArray[np.int32]]]
+    contours: list[tuple[float, Contour]]
     scale: float
     origin: Array
     outset_px: float
     """How far out of the contour the square's edge lies, in the contour's own pixels."""
+    size: tuple[int, int] = (0, 0)
+    """Width and height of the image they were found in, in their own pixels."""
+    others: Sequence[Contour] = ()
+    """All contours, also those around holes, or too ragged or open for a square."""
 
     def moved(self, origin: Array) -> Outlines:
         """Return the outlines of a part of an image whose first pixel is at ``origin`` (2,)."""
-        return self._replace(origin=self.origin + origin)
+        return replace(self, origin=self.origin + origin)
 
     def in_image(self, points: Array) -> Array:
         """Return points (..., 2) of a contour in pixels of the image."""
         return self.scale * points + (self.scale - 1) / 2 + self.origin
+
+    @cached_property
+    def quads(self) -> Array:
+        """Return the quads (Q, 4, 2) that they may be when their sides are straight."""
+        return _quads(self, whole=False)
+
+    @cached_property
+    def bent_quads(self) -> BentQuads:
+        """Return what they may be when their sides bulge."""
+        return _bent_quads(self)
 
 
 class BentQuads(NamedTuple):
@@ -96,21 +131,68 @@ class BentQuads(NamedTuple):
     bulges_px: Array
 
 
-def find_outlines(gray: Image, how: Binarisation = PLAIN) -> Outlines:
-    """Return the outlines of dark shapes, the longest first, at most ``MAX_CONTOURS``."""
-    if how.scale != 1.0:
-        interpolation = cv2.INTER_AREA if how.scale < 1 else cv2.INTER_CUBIC
-        gray = cv2.resize(gray, None, fx=how.scale, fy=how.scale, interpolation=interpolation)
+class Scaled(NamedTuple):
+    """An image at another resolution, and 255 where outlines are looked for in it; None is everywhere."""
+
+    gray: Image
+    worth: Image | None = None
+
+
+def scaled(gray: Image, scale: float) -> Scaled:
+    """Return an image at another resolution; of one that is enlarged, only the best parts are worth looking at."""
+    if scale == 1.0:
+        return Scaled(gray)
+    interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    other = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=interpolation)
+    worth = _worth_a_fine_look(gray) if scale > 1 else None
+    if worth is not None:
+        worth = cv2.resize(worth, other.shape[::-1], interpolation=cv2.INTER_NEAREST)
+    return Scaled(other, worth)
+
+
+def find_outlines(gray: Image, how: Binarisation = PLAIN, image: Scaled | None = None) -> Outlines:
+    """Return the outlines of dark shapes, the longest first, at most ``MAX_CONTOURS``.
+
+    ``image`` is what ``scaled`` makes of the gray one, if that is known.
+    """
+    gray, worth = scaled(gray, how.scale) if image is None else image
     smooth = cv2.blur(gray, (how.smooth_px,) * 2) if how.smooth_px > 1 else gray
     kind, offset = (cv2.THRESH_BINARY, -how.offset) if how.holes else (cv2.THRESH_BINARY_INV, how.offset)
     shapes = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, kind, how.window_px, offset)
+    looked_at = shapes.size
+    if worth is not None:
+        shapes &= worth
+        looked_at = cv2.countNonZero(worth)
     changes = cv2.countNonZero(cv2.absdiff(shapes[:, 1:], shapes[:, :-1]))
-    noisy = changes > NOISE * shapes.size  # hundreds of thousands of contours, and none of them a square
+    noisy = how.scale * changes > NOISE * looked_at  # hundreds of thousands of contours, and none of them a square
     contours = () if noisy else cv2.findContours(shapes, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)[0]
     if how.holes:
         contours = [contour[::-1] for contour in contours]  # holes are run around the other way
-    found = sorted(_plausible(contours), key=lambda outline: -outline[0])[:MAX_CONTOURS]
-    return Outlines(found, 1 / how.scale, np.zeros(2), INSET_PX if how.holes else OUTSET_PX)
+    return Outlines(
+        contours=_plausible(contours),
+        scale=1 / how.scale,
+        origin=np.zeros(2),
+        outset_px=INSET_PX if how.holes else OUTSET_PX,
+        size=(shapes.shape[1], shapes.shape[0]),
+        others=contours,
+    )
+
+
+def _worth_a_fine_look(gray: Image) -> Image | None:
+    """Return 255 where an image (H, W) is worth enlarging, ``FINE_PX`` at most, and 0 elsewhere; None when all is."""
+    if gray.size <= FINE_PX:
+        return None
+    rows, columns = (-(-extent // BLOCK_PX) for extent in gray.shape)
+    step = cv2.morphologyEx(gray, cv2.MORPH_GRADIENT, np.ones((STEP_PX, STEP_PX), np.uint8))
+    step = cv2.copyMakeBorder(
+        step, 0, rows * BLOCK_PX - len(gray), 0, columns * BLOCK_PX - gray.shape[1], cv2.BORDER_CONSTANT
+    )
+    largest = step.reshape(rows, BLOCK_PX, columns, BLOCK_PX).max(axis=(1, 3))
+    near = cv2.dilate(largest, np.ones((3, 3), np.uint8))
+    fine = np.zeros(near.size, np.uint8)
+    fine[np.argsort(-near.ravel().astype(int), kind="stable")[: FINE_PX // BLOCK_PX**2]] = 255
+    enlarged = cv2.resize(fine.reshape(rows, columns), None, fx=BLOCK_PX, fy=BLOCK_PX, interpolation=cv2.INTER_NEAREST)
+    return enlarged[: len(gray), : gray.shape[1]]
 
 
 def find_quads(gray: Image, how: Binarisation = PLAIN) -> Array:
@@ -123,7 +205,19 @@ def quads_of(outlines: Outlines, *, whole: bool = False) -> Array:
 
     ``whole`` leaves out outlines that are ragged, cut or covered: seldom squares, and long to look at.
     """
-    found = (_simplified(contour, perimeter, whole) for perimeter, contour in outlines.contours)
+    return _quads(outlines, whole=True) if whole else outlines.quads
+
+
+def bent_quads_of(outlines: Outlines) -> BentQuads:
+    """Return what outlines may be when their sides bulge: the four sharpest corners, and how they run between."""
+    return outlines.bent_quads
+
+
+def _quads(outlines: Outlines, *, whole: bool) -> Array:
+    found: list[NDArray[np.generic] | None] = []
+    for cut, (perimeter, contour) in zip(_cut(outlines), outlines.contours, strict=True):
+        uncut = _uncut(contour, perimeter, outlines.size) if cut and not whole else None
+        found.append(_simplified(contour, perimeter, whole) if uncut is None else uncut)
     quads = np.array([polygon for polygon in found if polygon is not None], dtype=float).reshape(-1, 4, 2)
     turned = _cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1]) < 0
     quads[turned] = quads[turned, ::-1]
@@ -131,8 +225,7 @@ def quads_of(outlines: Outlines, *, whole: bool = False) -> Array:
     return outlines.in_image(_grown(quads, outlines.outset_px))
 
 
-def bent_quads_of(outlines: Outlines) -> BentQuads:
-    """Return what outlines may be when their sides bulge: the four sharpest corners, and how they run between."""
+def _bent_quads(outlines: Outlines) -> BentQuads:
     contours, polygons = [], []
     for perimeter, contour in outlines.contours[:MAX_BENT_OUTLINES]:
         polygon = cv2.approxPolyDP(contour, BENT_TOLERANCE * perimeter, True)
@@ -150,15 +243,34 @@ def bent_quads_of(outlines: Outlines) -> BentQuads:
     return BentQuads(outlines.in_image(_grown(corners, outlines.outset_px)), outlines.scale * bulges)
 
 
-def _plausible(contours: Sequence[NDArray[np.int32]]) -> Iterator[tuple[float, NDArray[np.int32]]]:
-    """Yield perimeter and contour of those that run around ink, are long enough, and not too ragged for a square."""
-    for contour in contours:
-        if len(contour) >= 4:
-            area = -cv2.contourArea(contour, True)  # negative around ink, positive around holes in it
-            if area >= MIN_SIDE_PX**2:
-                perimeter = cv2.arcLength(contour, True)
-                if perimeter >= MIN_PERIMETER_PX and area >= LEAST_ROUNDNESS * perimeter**2:
-                    yield perimeter, contour
+def _plausible(contours: Sequence[Contour]) -> list[tuple[float, Contour]]:
+    """Return perimeters and contours, the longest first, of those that may be a square's: at most ``MAX_CONTOURS``.
+
+    They run around ink, are long enough, and not too ragged.
+    """
+    contours = [contour for contour in contours if len(contour) >= 4]
+    if not contours:
+        return []
+    area, perimeter = _sizes(contours)
+    use = (area >= MIN_SIDE_PX**2) & (perimeter >= MIN_PERIMETER_PX) & (area >= LEAST_ROUNDNESS * perimeter**2)
+    longest = np.flatnonzero(use)[np.argsort(-perimeter[use], kind="stable")[:MAX_CONTOURS]]
+    return [(float(perimeter[i]), contours[i]) for i in longest]
+
+
+def _sizes(contours: Sequence[Contour]) -> tuple[Array, Array]:
+    """Return the areas, negative of holes, and the perimeters (N,) of contours."""
+    starts = starts_of(contours)
+    points = np.concatenate(contours)[:, 0].astype(float)
+    after = np.roll(points, -1, axis=0)
+    after[np.append(starts[1:], len(points)) - 1] = points[starts]  # each contour ends where it began
+    area = np.add.reduceat(_cross(after, points), starts) / 2
+    return area, np.add.reduceat(np.sqrt(_squared(after - points)), starts)
+
+
+def starts_of(parts: Sequence[Contour]) -> NDArray[np.int64]:
+    """Return where each of several arrays (N,) begins once they are concatenated."""
+    lengths = np.fromiter(map(len, parts), np.int64, len(parts))
+    return np.cumsum(lengths) - lengths
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -179,23 +291,61 @@ def _grown(quads: Array, outset_px: float) -> Array:
     return quads + outset_px * (before - along) / np.maximum(_cross(before, along), LEAST_SINE)[..., None]
 
 
-def _simplified(contour: NDArray[np.int32], perimeter: float, whole: bool) -> NDArray[np.int32] | None:
-    """Return the convex quad (4, 1, 2) that a contour simplifies to at the first tolerance that gives one.
+def _simplified(contour: Contour, perimeter: float, whole: bool) -> Contour | None:
+    """Return the convex quad (4, 1, 2) that a contour simplifies to at the first tolerance that its sides bear.
 
-    Else the one that its hull does, unless only a ``whole`` square will do.
+    One not much smaller than a skinny quad's short sides moves its corners along the long ones.  Else the quad of the
+    finest tolerance that gives one, else its hull's, unless only a ``whole`` square will do.
     """
+    finest, quad = np.inf, None
     for tolerance in POLYGON_TOLERANCES[: WHOLE_TOLERANCES if whole else None]:
         polygon = cv2.approxPolyDP(contour, tolerance * perimeter, True)
         if len(polygon) == 4 and cv2.isContourConvex(polygon):
-            return polygon
-    if not whole:
+            if whole or _shortest(polygon) >= TOLERANCES_A_SIDE * tolerance * perimeter:
+                return polygon
+            finest, quad = min((finest, quad), (tolerance, polygon), key=lambda found: found[0])
+    if quad is None and not whole:
         hull = cv2.convexHull(contour)
         if 4 <= len(hull) < len(contour):
             return _simplified(hull, cv2.arcLength(hull, True), False)
-    return None
+    return quad
 
 
-def _sharpest(polygons: Sequence[NDArray[np.int32]]) -> tuple[Array, NDArray[np.bool_]]:
+def _shortest(polygon: Contour) -> float:
+    """Return how long the shortest side of a quad (4, 1, 2) is."""
+    (ax, ay), (bx, by), (cx, cy), (dx, dy) = polygon[:, 0].tolist()
+    return min(hypot(bx - ax, by - ay), hypot(cx - bx, cy - by), hypot(dx - cx, dy - cy), hypot(ax - dx, ay - dy))
+
+
+def _cut(outlines: Outlines) -> NDArray[np.bool_]:
+    """Return which outlines touch the border of the image they were found in."""
+    contours = [contour for _, contour in outlines.contours]
+    if not contours:
+        return np.zeros(0, dtype=bool)
+    points, starts = np.concatenate(contours)[:, 0], starts_of(contours)
+    low, high = np.minimum.reduceat(points, starts), np.maximum.reduceat(points, starts)
+    last = np.array(outlines.size) - 1
+    return np.asarray((low <= BORDER_PX).any(axis=1) | (high >= last - BORDER_PX).any(axis=1))
+
+
+def _uncut(contour: Contour, perimeter: float, size: tuple[int, int]) -> Array | None:
+    """Return the convex quad (4, 1, 2) that the border of an image of a size cut corners off; None if it cut none."""
+    polygon = cv2.approxPolyDP(cv2.convexHull(contour), BENT_TOLERANCE * perimeter, True)[:, 0].astype(float)
+    after = np.roll(polygon, -1, axis=0)
+    near_low = np.maximum(polygon, after) <= BORDER_PX
+    near_high = np.minimum(polygon, after) >= np.array(size) - 1 - BORDER_PX
+    sides = np.flatnonzero(~(near_low | near_high).any(axis=1))
+    if len(sides) != 4 or len(polygon) == 4:
+        return None
+    along = (after - polygon)[sides]
+    before, start = np.roll(along, 1, axis=0), polygon[np.roll(sides, 1)]
+    turn = _cross(before, along)
+    if not ((turn > 0).all() or (turn < 0).all()):
+        return None
+    return (start + before * (_cross(polygon[sides] - start, along) / turn)[:, None])[:, None]
+
+
+def _sharpest(polygons: Sequence[Contour]) -> tuple[Array, NDArray[np.bool_]]:
     """Return the four vertices of each polygon (N, 1, 2) that turn most (B, 4, 2), and which turn enough (B,)."""
     lengths = np.array([len(polygon) for polygon in polygons])
     rows, column = np.arange(len(polygons))[:, None], np.arange(MAX_VERTICES)
@@ -209,7 +359,7 @@ def _sharpest(polygons: Sequence[NDArray[np.int32]]) -> tuple[Array, NDArray[np.
     return vertices[rows, np.sort(order, axis=1)], turn[rows[:, 0], order[:, 3]] >= LEAST_TURN
 
 
-def _bulging(contours: Sequence[NDArray[np.int32]], corners: Array) -> tuple[Array, Array]:
+def _bulging(contours: Sequence[Contour], corners: Array) -> tuple[Array, Array]:
     """Return four corners (B, 4, 2) on each contour, and the bulges (B, 4, 2) of the sides between, as parabolas."""
     points = np.concatenate(contours)[:, 0].astype(float)
     lengths = np.array([len(contour) for contour in contours])

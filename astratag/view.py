@@ -12,6 +12,7 @@ from astratag.camera import Camera
 from astratag.checks import picture
 from astratag.cylinder import assumed_camera
 from astratag.effort import Tries
+from astratag.search import Binarisation, Outlines, Scaled
 
 Array = NDArray[np.float64]
 
@@ -23,7 +24,8 @@ MAX_BY_EDGES, MAX_ALIGNED, MAX_CURVED = 12, 8, 12
 class View:
     """One image as the detector works on it: gray, in linear light, and with its camera.
 
-    ``by_edges`` and ``aligned`` hold what was looked at closely in it, and end that when it was enough.
+    ``by_edges``, ``aligned`` and ``curved`` hold what was looked at closely in it, and end that when it was enough;
+    ``scaled`` holds it at the resolutions it was searched at, ``outlines`` what was found, one way and another.
     """
 
     gray: NDArray[np.uint8]
@@ -32,6 +34,8 @@ class View:
     by_edges: Tries = field(default_factory=lambda: Tries(MAX_BY_EDGES))
     aligned: Tries = field(default_factory=lambda: Tries(MAX_ALIGNED))
     curved: Tries = field(default_factory=lambda: Tries(MAX_CURVED))
+    scaled: dict[float, Scaled] = field(default_factory=dict)
+    outlines: dict[Binarisation, Outlines] = field(default_factory=dict)
 
     @property
     def some_camera(self) -> Camera:

@@ -19,13 +19,31 @@ from astratag.describe import outer_corners
 from astratag.detector import MAX_MATCHED
 from astratag.effort import Tries, first_distinct
 from astratag.geometry import LAYERS, TEMPLATE_UNITS, square
-from astratag.search import COARSE, MAX_CONTOURS, NARROW, PLAIN, bent_quads_of, find_outlines, quads_of
+from astratag.search import (
+    BLOCK_PX,
+    BROAD,
+    COARSE,
+    FAINT,
+    FINE_PX,
+    MAX_CONTOURS,
+    NARROW,
+    PLAIN,
+    SLANTED,
+    STEEP,
+    THIN,
+    TINY,
+    bent_quads_of,
+    find_outlines,
+    quads_of,
+    scaled,
+)
 from astratag.transforms import exp_so3, pose
 from astratag.view import MAX_ALIGNED, MAX_BY_EDGES
 from astratag.warp import HomographyWarp, PoseWarp
 from pipeline.render import render_marker
 
 HEIGHT, WIDTH = 240, 320
+EVERY_BINARISATION = (COARSE, NARROW, PLAIN, FAINT, TINY, BROAD, SLANTED, THIN, STEEP)
 
 
 def drawn(*outlines: np.ndarray) -> np.ndarray:
@@ -69,6 +87,33 @@ def test_a_square_with_a_notch_is_proposed_by_its_hull():
     outlines = find_outlines(drawn(notched))
     assert nearest(quads_of(outlines), corners)[2] < 2.0
     assert len(quads_of(outlines, whole=True)) == 0
+
+
+@pytest.mark.parametrize(
+    "corners", [[(152, 178), (58, 76), (61, 36), (191, 175)], [(119, 63), (140, 26), (202, 205), (164, 193)]]
+)
+def test_a_skinny_square_keeps_its_corners(corners):
+    """Seen at 80 degrees: its short sides are hardly longer than what a square-on outline is simplified by."""
+    assert nearest(quads_of(find_outlines(drawn(np.array(corners, float)))), np.array(corners, float))[2] < 4.0
+
+
+@pytest.mark.parametrize("cut", [(8.0, 120.0), (160.0, 6.0), (311.0, 120.0)], ids=["left", "top", "right"])
+def test_a_corner_beyond_the_border_is_where_its_sides_meet(cut):
+    outwards = np.sign(np.array(cut) - (WIDTH / 2, HEIGHT / 2))
+    corners = np.array(cut) + 14 * outwards + 24 * (np.array([(0, -1), (1, 0), (0, 1), (-1, 0)]) - outwards)
+    beyond = (corners < 0).any(axis=1) | (corners > (WIDTH, HEIGHT)).any(axis=1)
+    assert beyond.sum() == 1
+    assert nearest(quads_of(find_outlines(drawn(corners))), corners)[2] < 3.0
+
+
+def test_only_the_largest_steps_are_worth_a_fine_look():
+    image = np.full((720, 1280), 120, np.uint8)
+    image[::32, ::32] = 150
+    image[300:314, 700:714] = 10
+    worth = scaled(image, 2.0).worth
+    assert worth is not None and worth.shape == (1440, 2560)
+    assert cv2.countNonZero(worth) <= 4 * FINE_PX
+    assert worth[600 - BLOCK_PX : 628 + BLOCK_PX, 1400 - BLOCK_PX : 1428 + BLOCK_PX].all()
 
 
 def test_bulges_against_the_parabolas_drawn():
@@ -157,13 +202,13 @@ def test_no_image_is_looked_at_closely_more_often_than_bounded(kind, surface, mo
     )
     assert detector.find(view) == []
     assert len(view.by_edges.made) <= MAX_BY_EDGES and len(view.aligned.made) <= MAX_ALIGNED
-    assert counts["match"] <= MAX_MATCHED and counts["find_outlines"] <= 10
+    assert counts["match"] <= MAX_MATCHED and counts["find_outlines"] <= len(EVERY_BINARISATION)
     assert counts["grow"] <= len(LAYERS) * (MAX_BY_EDGES + MAX_ALIGNED)
 
 
 def test_noise_has_no_outlines_where_every_pixel_counts():
     noise = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
-    assert find_outlines(noise, NARROW).contours == []
+    assert all(find_outlines(noise, how).contours == [] for how in (NARROW, TINY, SLANTED, STEEP))
     assert len(find_outlines(noise, PLAIN).contours) <= MAX_CONTOURS
 
 
