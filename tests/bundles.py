@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -62,17 +64,21 @@ def seen_from(
     sigma_px: float,
     rng: np.random.Generator,
     t_s: float = 0.0,
-    bias_px: dict[int, float] | None = None,
+    bias_px: Mapping[int, Array] | None = None,
     only: set[int] | None = None,
 ) -> Detections:
-    """Return one frame's detections with Gaussian corner noise, and edges measured outward by ``bias_px``."""
+    """Return one frame's detections with Gaussian corner noise.
+
+    ``bias_px`` is how far a marker is measured outward, right and down of its place.
+    """
     found: dict[int, list[LayerDetection]] = {}
     T_chaser_target = mission.camera.T_chaser_cam.matrix() @ T_cam_target
     for expected in visible_layers(T_chaser_target, mission, CAMERA):
         if np.ptp(expected.corners_px, axis=0).min() < SMALLEST_SIDE_PX or (only and expected.marker_id not in only):
             continue
-        outward = (bias_px or {}).get(expected.marker_id, 0.0) * outward_shift(expected.corners_px[None])[0]
-        corners_px = expected.corners_px + outward + sigma_px * rng.standard_normal((4, 2))
+        outward, *shift = (bias_px or {}).get(expected.marker_id, np.zeros(3))
+        biased_px = expected.corners_px + outward * outward_shift(expected.corners_px[None])[0] + shift
+        corners_px = biased_px + sigma_px * rng.standard_normal((4, 2))
         found.setdefault(expected.marker_id, []).append(LayerDetection(expected.layer, corners_px, sigma_px))
     return Detections(
         t_capture_ns=T0_NS + round(t_s * 1e9),
@@ -115,7 +121,7 @@ def views(
     *,
     sigma_px: float,
     seed: int,
-    bias_px: dict[int, float] | None = None,
+    bias_px: Mapping[int, Array] | None = None,
     only: set[int] | None = None,
     told: tuple[MarkerSection, ...] | None = None,
 ) -> list[View]:

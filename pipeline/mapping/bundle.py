@@ -31,6 +31,8 @@ GATE = float(chi2.ppf(0.9999, LAYER_DOF))
 MEDIAN = float(chi2.ppf(0.5, LAYER_DOF))
 NEAREST_M = 1e-3
 MOST_STEPS = 60
+MOST_ROUNDS = 4
+"""Of leaving layers out, and taking back those that fit once others no longer pull."""
 FIRST_DAMPING, MOST_DAMPING = 1e-3, 1e8
 CONVERGED = 1e-7
 """Stop when the squared residuals no longer fall by this share."""
@@ -99,12 +101,13 @@ def adjust(views: Sequence[View], start: MapState, reference: int, edge_bias_px:
     """
     kept = [np.ones(len(view.corners.slot) // 4) for view in views]
     state = _minimised(views, start, reference, edge_bias_px, kept)
-    if drop:
+    for _ in range(MOST_ROUNDS if drop else 0):
         squares = [_fit(view, state, k).layers2() for k, view in enumerate(views)]
         usual = max(1.0, float(np.median(np.concatenate(squares))) / MEDIAN)
-        kept = [(squared <= GATE * usual).astype(float) for squared in squares]
-        if any((k == 0).any() for k in kept):
-            state = _minimised(views, state, reference, edge_bias_px, kept)
+        before, kept = kept, [(squared <= GATE * usual).astype(float) for squared in squares]
+        if all(np.array_equal(a, b) for a, b in zip(before, kept, strict=True)):
+            break
+        state = _minimised(views, state, reference, edge_bias_px, kept)
     return _bundle(views, state, reference, edge_bias_px, kept)
 
 

@@ -23,7 +23,7 @@ MOST_DROPPED = 0.5
 """Share of a marker's layers that may be left out before the marker itself is in doubt."""
 WORST_RMS_PX, WORST_MISFIT = 1.0, 9.0
 """Corners that fit worse than both are not those of one rigid target as the mission describes its markers."""
-LATERAL, POSITION, ATTITUDE = slice(0, 2), slice(0, 3), slice(3, 6)
+POSITION, ATTITUDE = slice(0, 3), slice(3, 6)
 
 
 @dataclass(frozen=True)
@@ -110,9 +110,10 @@ def estimate_map(
     _require_connected(views, sections, reference)
     T_target_reference = sections[reference].T_target_marker.matrix()
     start = first_map(views, reference, T_target_reference, edge_bias_px)
+    first = {marker.id: start.T_target_marker[marker.id] for marker in markers}
     used = chosen_views(views, most_views)
     try:
-        bundle = adjust(used, start_state(used, start.T_target_marker), reference, edge_bias_px)
+        bundle = adjust(used, start_state(used, first), reference, edge_bias_px)
         _require_one_map(used, bundle, start.elsewhere, reference, edge_bias_px, ambiguity_ratio)
     except np.linalg.LinAlgError as error:
         raise MapError("the views do not fix the map: show the markers from more sides") from error

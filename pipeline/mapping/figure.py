@@ -30,7 +30,7 @@ RESIDUAL_REACH = 4.0
 def draw_map(found: MarkerMap) -> Figure:
     """Return the page for a map."""
     figure = Figure(figsize=(14, 9.5), dpi=110, facecolor="white")
-    grid = figure.add_gridspec(2, 6, left=0.055, right=0.975, top=0.87, bottom=0.075, hspace=0.33, wspace=0.9)
+    grid = figure.add_gridspec(2, 6, left=0.055, right=0.95, top=0.87, bottom=0.075, hspace=0.33, wspace=0.9)
     inks = [MARKER_INKS[k % len(MARKER_INKS)] for k in range(len(found.markers))]
     outlines = [_outline(marker) for marker in found.markers]
     extent_m = float(np.ptp(np.concatenate(outlines), axis=0).max())
@@ -105,21 +105,21 @@ def _draw_marker(
 
 def _draw_residuals(ax: Axes, found: MarkerMap, inks: list[str]) -> None:
     """Draw what corners are off, right and down, each marker in its ink."""
-    _style(ax, "Residuals of the corners", "px; seen minus explained")
+    _style(ax, "Residuals of the corners", "")
     reach_px = RESIDUAL_REACH * max(marker.residual_rms_px for marker in found.markers)
     for marker, ink in zip(found.markers, inks, strict=True):
         x, y = marker.residuals_px.T
         label = f"{marker.section.id}: {marker.residual_rms_px:.3f} px rms, {len(x)} corners"
         ax.plot(x, y, ".", markersize=3, color=ink, alpha=0.6, label=label)
     ax.set(xlim=(-reach_px, reach_px), ylim=(reach_px, -reach_px), aspect="equal")
-    ax.set_xlabel("right", color=MUTED)
-    ax.set_ylabel("down", color=MUTED)
+    ax.set_xlabel("right, px, seen minus explained", color=MUTED)
+    ax.set_ylabel("down, px", color=MUTED)
     ax.legend(loc="upper left", frameon=False, fontsize=9, labelcolor=INK, markerscale=3)
 
 
 def _draw_sigmas(ax: Axes, found: MarkerMap, inks: list[str]) -> None:
     """Draw the standard deviations of each marker's pose about its own axes."""
-    _style(ax, "One standard deviation", "in the marker's own axes; mm on the left, degrees on the right")
+    _style(ax, "One standard deviation", "in the marker's own axes")
     estimated = [(m, ink) for m, ink in zip(found.markers, inks, strict=True) if m.section.id != found.reference]
     width = 0.8 / len(estimated)
     right = ax.twinx()
@@ -133,6 +133,8 @@ def _draw_sigmas(ax: Axes, found: MarkerMap, inks: list[str]) -> None:
     for axis in (ax, right):
         axis.tick_params(which="both", colors=MUTED, labelsize=9.5, length=0)
         axis.set_ylim(0, None)
+    ax.set_ylabel("mm", color=MUTED)
+    right.set_ylabel("degrees", color=MUTED)
     for side in right.spines.values():
         side.set_visible(False)
     ax.legend(loc="upper center", ncols=8, frameon=False, fontsize=9.5, labelcolor=INK)

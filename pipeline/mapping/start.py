@@ -60,7 +60,7 @@ def first_map(views: Sequence[View], reference: int, T_target_reference: Array, 
             return Start(placed, elsewhere)
         _, pair = max(edges, key=lambda edge: (edge[0], sorted(edge[1], reverse=True)))
         (beside,), (joins,) = pair & placed.keys(), pair - placed.keys()
-        bundles = _ways_to_join(views, placed, beside, joins, reference, edge_bias_px)
+        bundles = _ways_to_join(views, placed, beside, joins, edge_bias_px)
         if not bundles:
             raise MapError(
                 f"marker {joins} is not in one place beside marker {beside}: are its side and surface right, "
@@ -68,23 +68,22 @@ def first_map(views: Sequence[View], reference: int, T_target_reference: Array, 
             )
         if len(bundles) > 1:
             elsewhere[joins] = bundles[1].state.T_target_marker[joins]
-        placed = dict(bundles[0].state.T_target_marker)
+        placed[joins] = bundles[0].state.T_target_marker[joins]
 
 
 def _ways_to_join(
-    views: Sequence[View], placed: Mapping[int, Array], beside: int, joins: int, reference: int, edge_bias_px: float
+    views: Sequence[View], placed: Mapping[int, Array], beside: int, joins: int, edge_bias_px: float
 ) -> list[Bundle]:
-    """Return small bundles with a marker in each of the places that it may have, the best first."""
+    """Return small bundles with a marker in each of the places that it may have beside a known one, the best first."""
     known = {*placed, joins}
-    showing = [view.only(known) for view in views if joins in view.ids and placed.keys() & set(view.ids)]
-    showing = chosen_views(showing, TRIED_VIEWS)
-    both = [view for view in showing if beside in view.ids]
+    showing = chosen_views([view.only(known) for view in views if {beside, joins} <= set(view.ids)], TRIED_VIEWS)
+    present = {marker_id for view in showing for marker_id in view.ids} & placed.keys()
     bundles: list[Bundle] = []
-    for T_beside_joins in _places_beside(both, beside, joins):
-        T_target_marker = {**placed, joins: placed[beside] @ T_beside_joins}
+    for T_beside_joins in _places_beside(showing, beside, joins):
+        T_target_marker = {m: placed[m] for m in present} | {joins: placed[beside] @ T_beside_joins}
         try:
             start = start_state(showing, T_target_marker)
-            bundle = adjust(showing, start, reference, edge_bias_px, drop=False)
+            bundle = adjust(showing, start, beside, edge_bias_px, drop=False)
         except np.linalg.LinAlgError:
             continue
         found = bundle.state.T_target_marker[joins]
