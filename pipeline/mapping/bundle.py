@@ -9,7 +9,7 @@ synthesis", 2000, section 6.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -28,11 +28,14 @@ HUBER2 = float(chi2.ppf(0.99, LAYER_DOF))
 """Squared residual of a layer, in sigmas, from which on it counts less and less: P. Huber, 1964."""
 GATE = float(chi2.ppf(0.9999, LAYER_DOF))
 """A layer that fits worse than this, in units of the usual misfit, is taken for something else and left out."""
+LEAST_FITTING = 0.7
+"""Share of a marker's layers."""
 MEDIAN = float(chi2.ppf(0.5, LAYER_DOF))
 NEAREST_M = 1e-3
 MOST_STEPS = 60
-MOST_ROUNDS = 4
-"""Of leaving layers out, and taking back those that fit once others no longer pull."""
+ROUNDS = (100.0, 10.0, 1.0, 1.0)
+"""By how much the gate is wider in each round of leaving layers out: the worst first, since they pull at the others,
+which come back when they fit without them."""
 FIRST_DAMPING, MOST_DAMPING = 1e-3, 1e8
 CONVERGED = 1e-7
 """Stop when the squared residuals no longer fall by this share."""
@@ -65,6 +68,8 @@ class Bundle:
     """Of each marker's corners that were kept (N, 2), seen minus explained."""
     dropped: Mapping[int, int]
     """Layers of each marker that were left out."""
+    doubted: frozenset[int]
+    """Markers most of whose layers do not fit: theirs are not left out."""
     normalised2: Sequence[Array] = field(repr=False)
     """Squared residuals of every layer of every view, in sigmas."""
 
@@ -99,16 +104,32 @@ def adjust(views: Sequence[View], start: MapState, reference: int, edge_bias_px:
     ``edge_bias_px`` is the standard deviation of each component of a marker's bias.  With ``drop``, layers that do not
     fit are left out and the rest is adjusted again.
     """
+    doubted: frozenset[int] = frozenset()
     kept = [np.ones(len(view.corners.slot) // 4) for view in views]
     state = _minimised(views, start, reference, edge_bias_px, kept)
-    for _ in range(MOST_ROUNDS if drop else 0):
+    for wider in ROUNDS if drop else ():
         squares = [_fit(view, state, k).layers2() for k, view in enumerate(views)]
         usual = max(1.0, float(np.median(np.concatenate(squares))) / MEDIAN)
-        before, kept = kept, [(squared <= GATE * usual).astype(float) for squared in squares]
-        if all(np.array_equal(a, b) for a, b in zip(before, kept, strict=True)):
-            break
-        state = _minimised(views, state, reference, edge_bias_px, kept)
-    return _bundle(views, state, reference, edge_bias_px, kept)
+        fitting = [squared <= wider * GATE * usual for squared in squares]
+        doubted = _doubted(views, fitting, state.T_target_marker)
+        before, kept = kept, [(f | _of(view, doubted)).astype(float) for view, f in zip(views, fitting, strict=True)]
+        if any(not np.array_equal(a, b) for a, b in zip(before, kept, strict=True)):
+            state = _minimised(views, state, reference, edge_bias_px, kept)
+    return _bundle(views, state, reference, edge_bias_px, kept, doubted)
+
+
+def _doubted(views: Sequence[View], fitting: Sequence[NDArray[np.bool_]], marker_ids: Iterable[int]) -> frozenset[int]:
+    """Return the markers most of whose layers do not fit: then it is not the layers that are wrong."""
+    shares = {
+        marker_id: np.concatenate([f[_of(view, {marker_id})] for view, f in zip(views, fitting, strict=True)]).mean()
+        for marker_id in marker_ids
+    }
+    return frozenset(marker_id for marker_id, share in shares.items() if share < LEAST_FITTING)
+
+
+def _of(view: View, marker_ids: Collection[int]) -> NDArray[np.bool_]:
+    """Tell which layers of a view are those of some markers."""
+    return np.isin(np.array(view.ids)[view.corners.slot[::4]], list(marker_ids))
 
 
 def cost_of_view(view: View, T_cam_target: Array, T_target_marker: Mapping[int, Array]) -> float:
@@ -263,7 +284,12 @@ def _solve_scaled(A: Array, b: Array) -> Array:
 
 
 def _bundle(
-    views: Sequence[View], state: MapState, reference: int, edge_bias_px: float, kept: Sequence[Array]
+    views: Sequence[View],
+    state: MapState,
+    reference: int,
+    edge_bias_px: float,
+    kept: Sequence[Array],
+    doubted: frozenset[int],
 ) -> Bundle:
     """Return a bundle of a state that has converged.  Raises LinAlgError when the views do not fix the map."""
     ids = _estimated(state, reference)
@@ -290,5 +316,6 @@ def _bundle(
         misfit=misfit,
         residuals_px={marker_id: np.concatenate(parts) for marker_id, parts in residuals.items()},
         dropped=dropped,
+        doubted=doubted,
         normalised2=[fit.layers2() for fit in fits],
     )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from astratag.transforms import wxyz_from_rotation
 from pipeline.mapping.bundle import Bundle, MapState, adjust
 from pipeline.mapping.start import MapError, first_map, is_elsewhere, start_state, together
-from pipeline.mapping.views import View, chosen_views
+from pipeline.mapping.views import LEAST_MARKERS, View, chosen_views
 from pipeline.mission import MarkerSection, Mission, PoseSection
 
 Array = NDArray[np.float64]
@@ -19,8 +19,6 @@ Array = NDArray[np.float64]
 MOST_VIEWS = 120
 """More add little: they are chosen to be different from each other, and their errors are alike."""
 LEAST_VIEWS = 5
-MOST_DROPPED = 0.5
-"""Share of a marker's layers that may be left out before the marker itself is in doubt."""
 WORST_RMS_PX, WORST_MISFIT = 1.0, 9.0
 """Corners that fit worse than both are not those of one rigid target as the mission describes its markers."""
 POSITION, ATTITUDE = slice(0, 3), slice(3, 6)
@@ -107,6 +105,7 @@ def estimate_map(
     reference = markers[0].id if reference is None else reference
     if reference not in sections:
         raise MapError(f"the reference, marker {reference}, is not in the mission: it lists {_listed(sections)}")
+    views = [of_these for view in views if len((of_these := view.only(sections)).markers) >= LEAST_MARKERS]
     _require_connected(views, sections, reference)
     T_target_reference = sections[reference].T_target_marker.matrix()
     start = first_map(views, reference, T_target_reference, edge_bias_px)
@@ -118,7 +117,7 @@ def estimate_map(
     except np.linalg.LinAlgError as error:
         raise MapError("the views do not fix the map: show the markers from more sides") from error
     mapped = tuple(_mapped(marker, used, bundle) for marker in markers)
-    for marker in mapped:
+    for marker in sorted(mapped, key=lambda marker: -marker.residual_rms_px):
         _require_good(marker, bundle, wanted or Wanted())
     return MarkerMap(reference, mapped, len(used), len(views), bundle.misfit, bundle.covariance)
 
@@ -186,14 +185,11 @@ def _require_one_map(
 
 def _require_good(marker: MappedMarker, bundle: Bundle, wanted: Wanted) -> None:
     """Raise MapError when a marker contradicts the others, or is known less well than wanted."""
-    marker_id, layers = marker.section.id, len(marker.residuals_px) // 4
-    if marker.dropped_layers > MOST_DROPPED * (layers + marker.dropped_layers) or (
-        marker.residual_rms_px > WORST_RMS_PX and bundle.misfit > WORST_MISFIT
-    ):
+    marker_id = marker.section.id
+    if marker_id in bundle.doubted or (marker.residual_rms_px > WORST_RMS_PX and bundle.misfit > WORST_MISFIT):
         raise MapError(
-            f"marker {marker_id} does not fit a rigid target ({marker.dropped_layers} of "
-            f"{layers + marker.dropped_layers} layers left out, the others {marker.residual_rms_px:.2f} px off): "
-            f"is its side {marker.section.side_m} m, and its surface {marker.section.surface.kind}?"
+            f"marker {marker_id} does not fit a rigid target, its corners are {marker.residual_rms_px:.2f} px off: is "
+            f"its side {marker.section.side_m} m, its surface {marker.section.surface.kind}, and is it fixed?"
         )
     limit_m = wanted.position_sides * marker.section.side_m
     if marker.position_sigma_m > limit_m or marker.attitude_sigma_rad > wanted.attitude_rad:
