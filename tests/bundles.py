@@ -14,6 +14,7 @@ from astratag.transforms import exp_so3, pose
 from pipeline.convert import calibration_message, points_message, pose_message
 from pipeline.corner_filter import outward_shift
 from pipeline.expected import visible_layers
+from pipeline.mapping.bundle import BIAS_DOF
 from pipeline.mapping.estimate import pose_section
 from pipeline.mapping.views import View, view_of
 from pipeline.mission import CameraSection, CylinderSection, MarkerSection, Mission, PoseSection
@@ -69,15 +70,16 @@ def seen_from(
 ) -> Detections:
     """Return one frame's detections with Gaussian corner noise.
 
-    ``bias_px`` is how far a marker is measured outward, right and down of its place.
+    ``bias_px`` (11,) is how far a marker's corners are measured beside their place, as in ``Corners.by_bias``.
     """
     found: dict[int, list[LayerDetection]] = {}
     T_chaser_target = mission.camera.T_chaser_cam.matrix() @ T_cam_target
     for expected in visible_layers(T_chaser_target, mission, CAMERA):
         if np.ptp(expected.corners_px, axis=0).min() < SMALLEST_SIDE_PX or (only and expected.marker_id not in only):
             continue
-        outward, *shift = (bias_px or {}).get(expected.marker_id, np.zeros(3))
-        biased_px = expected.corners_px + outward * outward_shift(expected.corners_px[None])[0] + shift
+        bias = (bias_px or {}).get(expected.marker_id, np.zeros(BIAS_DOF))
+        outward_px = bias[0] * outward_shift(expected.corners_px[None])[0]
+        biased_px = expected.corners_px + outward_px + bias[1:3] + bias[3:].reshape(4, 2)
         corners_px = biased_px + sigma_px * rng.standard_normal((4, 2))
         found.setdefault(expected.marker_id, []).append(LayerDetection(expected.layer, corners_px, sigma_px))
     return Detections(

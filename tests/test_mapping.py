@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from astratag.transforms import difference, exp_so3, inverse, pose
-from pipeline.mapping.bundle import adjust
+from pipeline.mapping.bundle import BIAS_DOF, adjust
 from pipeline.mapping.estimate import MarkerMap, Wanted, estimate_map, pose_section
 from pipeline.mapping.start import MapError, start_state, together
 from pipeline.mapping.views import View, chosen_views
@@ -51,7 +51,7 @@ def test_errors_are_what_the_covariance_says():
     squared, dof = 0.0, 0
     for seed in range(8):
         rng = np.random.default_rng((SEED, seed))
-        bias_px = {marker.id: EDGE_BIAS_PX * rng.standard_normal(3) for marker in MARKERS}
+        bias_px = {marker.id: EDGE_BIAS_PX * rng.standard_normal(BIAS_DOF) for marker in MARKERS}
         found = estimated(views(MISSION, round_trip(24), sigma_px=0.15, seed=seed, bias_px=bias_px))
         joint = np.concatenate([e for marker_id, e in errors(found).items() if marker_id != found.reference])
         squared += float(joint @ np.linalg.solve(found.joint_covariance, joint))

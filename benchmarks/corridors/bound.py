@@ -16,16 +16,18 @@ from numpy.typing import NDArray
 
 from astratag.camera import Camera
 from astratag.transforms import inverse, skew, transform
-from pipeline.convert import pose_matrix, vector_array
+from pipeline.convert import points_array, pose_matrix, vector_array
 from pipeline.dynamics import ATTITUDE, MOTION, POSITION, RATE, VELOCITY, Motion, process_noise
 from pipeline.mission import Mission
 from pipeline.pose_filter import corners_on_target
-from schemas import Detections, LayerCorners, Truth
+from schemas import Detections, Truth
 
 Array = NDArray[np.float64]
 Key = tuple[int, int, int]
 """Marker, layer, and the bin of range."""
 STATES = 12
+GROSS_PX = 0.5
+"""RMS of a layer's corners beyond which they are not noise: ten times what the detector promises at its worst."""
 LEAST_SAMPLES = 5
 """A correlation in time from fewer is not believed."""
 MOST_CORRELATED = 0.95
@@ -59,10 +61,31 @@ class CornerNoise:
         return self.rms_px**2 * (1 + r) / (1 - r)
 
 
-def mapped_layers(frame: Frame, mission: Mission) -> list[tuple[int, LayerCorners]]:
-    """Return the layers of markers of the map that were measured in a frame, with their marker."""
+@dataclass(frozen=True, eq=False)
+class MeasuredLayer:
+    """A layer of a marker of the map that was measured in a frame, and what its corners (4, 2) px are off."""
+
+    marker_id: int
+    layer: int
+    off_px: Array
+
+    @property
+    def is_gross(self) -> bool:
+        """Tell whether this is no noise but something else, which a filter has to refuse."""
+        return float(np.sqrt(np.mean(self.off_px**2))) > GROSS_PX
+
+
+def measured_layers(frame: Frame, mission: Mission, camera: Camera) -> list[MeasuredLayer]:
+    """Return the layers that were measured in a frame: seen minus true."""
+    T_cam_target = inverse(mission.camera.T_chaser_cam.matrix()) @ pose_matrix(frame.truth.T_chaser_target)
     ids = {marker.id for marker in mission.markers}
-    return [(d.marker_id, layer) for d in frame.detections.detections if d.marker_id in ids for layer in d.layers]
+    found = []
+    for detection in frame.detections.detections:
+        for layer in detection.layers if detection.marker_id in ids else ():
+            points = true_points(detection.marker_id, layer.layer, mission)
+            off_px = points_array(layer.corners_px) - camera.project(transform(T_cam_target, points))
+            found.append(MeasuredLayer(detection.marker_id, layer.layer, off_px))
+    return found
 
 
 def true_points(marker_id: int, layer: int, mission: Mission) -> Array:
@@ -73,15 +96,12 @@ def true_points(marker_id: int, layer: int, mission: Mission) -> Array:
 
 
 def corner_residuals(frames: Sequence[Frame], mission: Mission, camera: Camera) -> dict[Key, list[tuple[int, Array]]]:
-    """Return by layer and range the frames' numbers and what their corners (4, 2) px are off: seen minus true."""
+    """Return by layer and range the frames' numbers and what their corners (4, 2) px are off, gross ones left out."""
     residuals: dict[Key, list[tuple[int, Array]]] = defaultdict(list)
-    T_cam_chaser = inverse(mission.camera.T_chaser_cam.matrix())
     for k, frame in enumerate(frames):
-        T_cam_target = T_cam_chaser @ pose_matrix(frame.truth.T_chaser_target)
-        for marker_id, layer in mapped_layers(frame, mission):
-            true_px = camera.project(transform(T_cam_target, true_points(marker_id, layer.layer, mission)))
-            seen_px = np.array([(p.x_px, p.y_px) for p in layer.corners_px])
-            residuals[marker_id, layer.layer, frame.range_bin].append((k, seen_px - true_px))
+        for seen in measured_layers(frame, mission, camera):
+            if not seen.is_gross:
+                residuals[seen.marker_id, seen.layer, frame.range_bin].append((k, seen.off_px))
     return dict(residuals)
 
 
@@ -113,9 +133,11 @@ def posterior_bound(
             F = motion.transition(dt_s, settings)[MOTION, MOTION]
             P = F @ P @ F.T + process_noise(dt_s, settings)[MOTION, MOTION]
         information = np.linalg.inv(P)
-        for marker_id, layer in mapped_layers(frame, mission):
-            H = _corner_jacobian(motion, true_points(marker_id, layer.layer, mission), mission, camera)
-            variance = noise[marker_id, layer.layer, frame.range_bin].variance_px2(correlated=correlated)
+        for seen in measured_layers(frame, mission, camera):
+            if seen.is_gross:
+                continue
+            H = _corner_jacobian(motion, true_points(seen.marker_id, seen.layer, mission), mission, camera)
+            variance = noise[seen.marker_id, seen.layer, frame.range_bin].variance_px2(correlated=correlated)
             information = information + H.T @ H / variance
         P = np.linalg.inv(information)
         P = (P + P.T) / 2

@@ -116,7 +116,7 @@ RENDERED = (TILTED, BUNDLE)
 def render(corridor: Corridor, path: Path) -> Path:
     """Render a corridor into a recording with truth, and return its path.  The same seed gives the same messages."""
     cv2.setNumThreads(1)
-    mission, scene = corridor.mission, _scene(corridor)
+    mission, scene = corridor.mission, scene_of(corridor)
     T_target_marker = mission.markers[0].T_target_marker.matrix()
     stamps_ns = frame_stamps_ns(START_NS, corridor.rate_hz, round(corridor.approach.duration_s * corridor.rate_hz) + 1)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -133,13 +133,13 @@ def render(corridor: Corridor, path: Path) -> Path:
             T_chaser_cam = mission.camera.T_chaser_cam.matrix()
             truth = truth_message(motion, T_chaser_cam=T_chaser_cam, T_target_marker=T_target_marker, t_capture_ns=t_ns)
             write(truth, sequence, t_ns)
-            image = CompressedImage(frame_id=mission.camera.name, data=_jpeg(corridor, scene, t_s), format="jpeg")
+            image = CompressedImage(frame_id=mission.camera.name, data=picture_at(corridor, scene, t_s), format="jpeg")
             image.timestamp.FromNanoseconds(t_ns)
             write(image, sequence, t_ns)
     return path
 
 
-def _jpeg(corridor: Corridor, scene: Scene, t_s: float) -> bytes:
+def picture_at(corridor: Corridor, scene: Scene, t_s: float) -> bytes:
     """Return the picture taken with mid-exposure at ``t_s``."""
     T_marker_target = inverse(corridor.mission.markers[0].T_target_marker.matrix())
     instants_s = t_s + EXPOSURE_S * ((np.arange(RAYS) + 0.5) / RAYS - 0.5)
@@ -152,7 +152,7 @@ def _jpeg(corridor: Corridor, scene: Scene, t_s: float) -> bytes:
     return data.tobytes()
 
 
-def _scene(corridor: Corridor) -> Scene:
+def scene_of(corridor: Corridor) -> Scene:
     """Return markers, each on a plate or a tube of its own, before a wall; scene axes are the target's."""
     dictionary = load_dictionary(corridor.mission.dictionary)
     bodies = [Body(Plate(WALL_M, WALL_M), WALL, pose(np.eye(3), [0.0, 0.0, -0.08]))]

@@ -1,10 +1,10 @@
 """Bundle adjustment: the marker map and the camera's place in every view that explain all corners best.
 
 Unknown are ``T_target_marker`` of every marker but the reference, ``T_cam_target`` of every view, and for each marker
-how far all its edges are measured outward, right and down of their place, by its print, its light or the lens, which
-is kept near zero.  Poses are perturbed on the right, metres then radians.  The views are eliminated first (Schur
-complement), so that the effort grows with their number only linearly: Triggs et al., "Bundle adjustment: a modern
-synthesis", 2000, section 6.
+how far its corners are measured beside their place in all views alike, by its print, its light or the lens: together
+and each by itself, kept near zero.  Poses are perturbed on the right, metres then radians.  The views are eliminated
+first (Schur complement), so that the effort grows with their number only linearly: Triggs et al., "Bundle adjustment:
+a modern synthesis", 2000, section 6.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pipeline.mapping.views import View
 
 Array = NDArray[np.float64]
 
-POSE_DOF, BIAS_DOF = 6, 3
+POSE_DOF, BIAS_DOF = 6, 11
 LAYER_DOF = 8
 """Image coordinates of the four corners of one black square."""
 HUBER2 = float(chi2.ppf(0.99, LAYER_DOF))
@@ -49,7 +49,7 @@ class MapState:
     T_cam_target: Sequence[Array]
     """One a view."""
     bias_px: Mapping[int, Array]
-    """(3,) of each marker: outward, right, down."""
+    """(11,) of each marker, as in ``Corners.by_bias``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ class _Fit:
     by_marker: Array
     """(N, 2, 6) by the pose of the marker that each corner belongs to."""
     by_bias: Array
-    """(N, 2, 3) by the bias of that marker."""
+    """(N, 2, 11) by the bias of that marker."""
 
     def layers2(self) -> Array:
         """Return the squared residual of each layer."""

@@ -51,7 +51,8 @@ class Corners:
     seen_px: Array
     """(N, 2)"""
     by_bias: Array
-    """(N, 2, 3) how each moves when all edges of its square move outward, or its marker right or down, by a pixel."""
+    """(N, 2, 11) how each moves with its marker's bias: when all edges move outward, all corners right or down, and the
+    first corner right or down, the second, and so on, by a pixel."""
     sigma_px: Array
     """(N,)"""
 
@@ -94,7 +95,9 @@ class View:
 
 def _by_bias(quads_px: Array) -> Array:
     outward = outward_shift(quads_px).reshape(-1, 2, 1)
-    return np.concatenate([outward, np.broadcast_to(np.eye(2), (len(outward), 2, 2))], axis=2)
+    together = np.broadcast_to(np.eye(2), (len(outward), 2, 2))
+    alone = np.tile(np.eye(8).reshape(4, 2, 8), (len(quads_px), 1, 1))
+    return np.concatenate([outward, together, alone], axis=2)
 
 
 def view_of(
