@@ -21,7 +21,14 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.corridors.bound import CornerNoise, Frame, corner_residuals, measured_noise, posterior_bound
+from benchmarks.corridors.bound import (
+    CornerNoise,
+    Frame,
+    corner_residuals,
+    measured_layers,
+    measured_noise,
+    posterior_bound,
+)
 from benchmarks.corridors.scenes import RENDERED, render
 from pipeline.convert import NS_PER_S, camera_from_calibration, pose_matrix
 from pipeline.detector import DetectorStep
@@ -58,6 +65,7 @@ class Flight:
     bound_m: Array
     """The same with noise that is correlated in time as it was measured."""
     noise: dict[tuple[int, int, int], CornerNoise]
+    gross_layers: list[int]
 
 
 @dataclass(frozen=True)
@@ -68,6 +76,8 @@ class Row:
     far_m: float
     near_m: float
     frames: int
+    gross_layers: int
+    """Layers whose corners were grossly off: the filter has to refuse them, and they count in nothing else here."""
     corner_rms_px: float
     correlation: float
     rms_mm: float
@@ -128,6 +138,7 @@ def fly(name: str, path: Path) -> Flight:
         bound_white_m=white,
         bound_m=bound,
         noise=noise,
+        gross_layers=[sum(seen.is_gross for seen in measured_layers(frame, mission, camera)) for frame in frames],
     )
 
 
@@ -184,6 +195,7 @@ def _row(flight: Flight, chosen: NDArray[np.bool_], far_m: float, near_m: float)
         far_m=far_m,
         near_m=near_m,
         frames=int(chosen.sum()),
+        gross_layers=sum(flight.gross_layers[k] for k in np.flatnonzero(chosen)),
         corner_rms_px=float(np.sqrt(np.average(rms_px**2, weights=samples))),
         correlation=float(np.average(correlation, weights=samples * rms_px**2)),
         rms_mm=rms_m * 1e3,
@@ -207,6 +219,7 @@ def print_rows(rows: list[Row], console: Console) -> None:
     for heading in (
         "range m",
         "frames",
+        "gross",
         "corners px",
         "correlated",
         "RMS mm",
@@ -225,6 +238,7 @@ def print_rows(rows: list[Row], console: Console) -> None:
             "" if row.corridor == before else row.corridor,
             "all" if overall else f"{row.far_m:g} to {row.near_m:g}",
             f"{row.frames}",
+            f"{row.gross_layers}",
             f"{row.corner_rms_px:.3f}",
             f"{row.correlation:.2f}",
             f"{row.rms_mm:.3f}",
