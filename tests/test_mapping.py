@@ -24,6 +24,7 @@ UNKNOWN = tuple(
     marker if marker.id == 7 else marker.model_copy(update={"T_target_marker": PoseSection()}) for marker in MARKERS
 )
 """What is told: sides, surfaces, and where the reference is."""
+LOOSE = Wanted(position_sides=0.1, attitude_rad=0.1)
 
 
 def estimated(seen: list[View], markers: tuple[MarkerSection, ...] = UNKNOWN, **kwargs: object) -> MarkerMap:
@@ -47,12 +48,12 @@ def test_noiseless_corners_give_the_map_exactly():
 
 
 def test_errors_are_what_the_covariance_says():
-    """Eight targets' worth of noise and biases: the mean error squared, in sigmas, is inside its 99 % band."""
+    """Six targets' worth of noise and biases: the mean error squared, in sigmas, is inside its 99 % band."""
     squared, dof = 0.0, 0
-    for seed in range(8):
+    for seed in range(6):
         rng = np.random.default_rng((SEED, seed))
         bias_px = {marker.id: EDGE_BIAS_PX * rng.standard_normal(BIAS_DOF) for marker in MARKERS}
-        found = estimated(views(MISSION, round_trip(24), sigma_px=0.15, seed=seed, bias_px=bias_px))
+        found = estimated(views(MISSION, round_trip(16), sigma_px=0.15, seed=seed, bias_px=bias_px))
         joint = np.concatenate([e for marker_id, e in errors(found).items() if marker_id != found.reference])
         squared += float(joint @ np.linalg.solve(found.joint_covariance, joint))
         dof += len(joint)
@@ -62,13 +63,13 @@ def test_errors_are_what_the_covariance_says():
 
 def test_one_bundle_predicts_its_own_spread():
     """The covariance of a marker shrinks as one over the square root of the number of independent views."""
-    few = estimated(views(MISSION, round_trip(20), sigma_px=0.5, seed=1), edge_bias_px=1e-4)
-    many = estimated(views(MISSION, round_trip(80), sigma_px=0.5, seed=1), edge_bias_px=1e-4)
+    few = estimated(views(MISSION, round_trip(12), sigma_px=0.5, seed=1), edge_bias_px=1e-4, wanted=LOOSE)
+    many = estimated(views(MISSION, round_trip(48), sigma_px=0.5, seed=1), edge_bias_px=1e-4, wanted=LOOSE)
     for a, b in zip(few.markers[1:], many.markers[1:], strict=True):
         assert a.position_sigma_m / b.position_sigma_m == pytest.approx(2.0, rel=0.2)
 
 
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(turn=st.tuples(*[st.floats(-3, 3)] * 3), shift=st.tuples(*[st.floats(-10, 10)] * 3))
 def test_the_map_moves_with_its_reference(turn, shift):
     """Where the reference is on the target is the mission's to say; what is between markers is the views'."""
@@ -90,15 +91,14 @@ def test_another_reference_gives_the_same_map():
         assert np.abs(error).max() < 1e-6
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_mirror_image_is_not_taken_for_the_map(seed: int):
     """From afar each small marker alone allows two poses in nearly every view; together one map is left."""
-    places = [looking(0.5 * np.sin(0.7 * k), 0.35 * np.cos(k), 1.7 - 0.01 * k) for k in range(40)]
+    places = [looking(0.5 * np.sin(0.7 * k), 0.35 * np.cos(k), 1.7 - 0.02 * k) for k in range(20)]
     seen = views(MISSION, places, sigma_px=0.15, seed=seed)
     both = [len(marker.poses_cam_marker) for view in seen for marker in view.markers]
-    assert np.mean(both) > 1.3
-    loose = Wanted(position_sides=0.1, attitude_rad=0.1)
-    for error in errors(estimated(seen, tuple(m for m in UNKNOWN if m.id != 15), wanted=loose)).values():
+    assert np.mean(both) > 1.2
+    for error in errors(estimated(seen, tuple(m for m in UNKNOWN if m.id != 15), wanted=LOOSE)).values():
         assert np.linalg.norm(error[3:]) < np.radians(2)
 
 
@@ -200,6 +200,6 @@ def test_a_wrong_side_is_found_out(wrong):
 def test_a_marker_that_moves_on_the_target_is_found_out():
     shaken = MARKERS[1].model_copy(update={"T_target_marker": PoseSection(translation_m=(0.1, -0.2, 0.15))})
     loose = MISSION.model_copy(update={"markers": (MARKERS[0], shaken, *MARKERS[2:])})
-    places = round_trip(32)
+    places = round_trip(16)
     seen = views(MISSION, places[::2], sigma_px=0.1, seed=SEED) + views(loose, places[1::2], sigma_px=0.1, seed=SEED)
     assert "does not fit a rigid target" in refusal(seen)
