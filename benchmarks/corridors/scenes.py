@@ -69,7 +69,7 @@ TILTED = Corridor(
     name="flat, tilted 15 degrees",
     mission=_mission(MarkerSection(id=12, side_m=0.1)),
     approach=Approach(
-        duration_s=12.0,
+        duration_s=22.0,
         start_m=1.3,
         end_m=0.15,
         end_speed_m_s=0.02,
@@ -79,7 +79,7 @@ TILTED = Corridor(
     ),
     to_sun_cam=(0.75, -0.25, -0.45),
     irradiance=0.8,
-    rate_hz=8.0,
+    rate_hz=5.0,
     seed=1,
 )
 BUNDLE = Corridor(
@@ -97,7 +97,7 @@ BUNDLE = Corridor(
         ),
     ),
     approach=Approach(
-        duration_s=12.0,
+        duration_s=22.0,
         start_m=1.4,
         end_m=0.2,
         end_speed_m_s=0.02,
@@ -107,7 +107,7 @@ BUNDLE = Corridor(
     ),
     to_sun_cam=(-0.2, 0.5, -0.8),
     irradiance=1.0,
-    rate_hz=8.0,
+    rate_hz=5.0,
     seed=2,
 )
 RENDERED = (TILTED, BUNDLE)
