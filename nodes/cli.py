@@ -79,6 +79,9 @@ def _parser() -> argparse.ArgumentParser:
     _marker(command("marker", "nodes.tools:marker", "Draw markers to print, at their exact size.", example))
     example = "relnav dictionary astratag48h12 --count 100 --out fleet.json"
     _dictionary(command("dictionary", "nodes.tools:dictionary", "Choose identities that are far apart.", example))
+    example = "relnav map out/live/run.mcap --mission markers.yaml --out mission.yaml"
+    text = "Estimate where a target's markers are, from a recording that shows them together."
+    _map(command("map", "nodes.mapping:marker_map", text, example))
     score = command("score", "nodes.tools:score", "Score a recorded run.", "relnav score out/replay/run.mcap")
     score.add_argument("recording", metavar="RUN", type=Path, help="the run.mcap of a replay or a live run")
     example = "relnav recover run.mcap"
@@ -190,6 +193,27 @@ def _dictionary(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--count", type=int, required=True, metavar="N", help="how many identities")
     parser.add_argument("--seed", type=int, default=0, help="another seed, another choice (default: %(default)s)")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON that --dictionary reads")
+
+
+def _map(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "recordings", nargs="+", metavar="RECORDING", help="recordings, videos or folders of images of one target"
+    )
+    out = Path("out/map/mission.yaml")
+    parser.add_argument("--out", type=Path, default=out, metavar="FILE", help="the mission to write (%(default)s)")
+    parser.add_argument("--overwrite", action="store_true", help="write over an earlier map")
+    mission = "sides and surfaces of the markers, and the rest (default: the recording's)"
+    parser.add_argument("--mission", type=Path, metavar="FILE", help=mission)
+    parser.add_argument("--camera", type=Path, metavar="FILE", help="calibration (default: the recording's)")
+    parser.add_argument("--scale-camera", action="store_true", help="scale a calibration of another image size")
+    reference = "marker that stays where the mission has it (default: the first it lists)"
+    parser.add_argument("--reference", type=_natural, metavar="ID", help=reference)
+    wanted = "largest 1 sigma of a marker's position, in its sides (%(default)s)"
+    parser.add_argument("--within-sides", type=_positive, default=0.01, metavar="X", help=wanted)
+    wanted = "largest 1 sigma of a marker's attitude, degrees (%(default)s)"
+    parser.add_argument("--within-deg", type=_positive, default=0.5, metavar="X", help=wanted)
+    views = "most frames used; they are chosen to show the target from all sides (%(default)s)"
+    parser.add_argument("--views", type=_natural, default=120, metavar="N", help=views)
 
 
 def _export(parser: argparse.ArgumentParser) -> None:

@@ -22,7 +22,7 @@ from schemas import Envelope, Stamp
 from schemas.topics import FRAME
 from tests.small_recording import CAMERA, MISSION, write_small_recording
 
-COMMANDS = ("replay", "live", "detect", "marker", "dictionary", "score", "recover", "export", "doctor", "node")
+COMMANDS = ("replay", "live", "detect", "marker", "dictionary", "map", "score", "recover", "export", "doctor", "node")
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,1 @@
+"""The target's marker map, estimated from views that show several of its markers together."""
