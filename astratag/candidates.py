@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astratag.align import COARSE_BLUR, COARSE_STEPS, FINE_STEPS, align
+from astratag.compiled import CUBE, MATRIX, compiled
 from astratag.geometry import LAYERS, TEMPLATE_UNITS, square
 from astratag.relight import RELIT_SAMPLES, relit_cells
 from astratag.search import BentQuads
@@ -22,7 +23,7 @@ from astratag.signature import (
     sample,
 )
 from astratag.tps import KNOTS, ThinPlate
-from astratag.warp import BentWarp, FittedWarp, HomographyWarp
+from astratag.warp import LEAST_DEPTH, BentWarp, FittedWarp, HomographyWarp, plane_of
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -129,23 +130,18 @@ def _frame_points() -> Array:
 FRAME = _frame_points()
 
 
-def points_in(quads: Array, template: Array) -> NDArray[np.float32]:
-    """Return where template points (S, 2) lie (Q, S, 2) when each quad (Q, 4, 2) is the outer square.
-
-    The projective map of the unit square onto four points in closed form: Heckbert, "Fundamentals of texture
-    mapping and image warping", 1989.
-    """
-    p0, p1, p2, p3 = (quads[:, corner] for corner in range(4))
-    d1, d2, total = p1 - p2, p3 - p2, p0 - p1 + p2 - p3
-    area = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
-    area = np.where(np.abs(area) > 1e-9, area, np.inf)
-    g = ((total[:, 0] * d2[:, 1] - total[:, 1] * d2[:, 0]) / area)[:, None]
-    h = ((d1[:, 0] * total[:, 1] - d1[:, 1] * total[:, 0]) / area)[:, None]
-    across, down = p1 - p0 + g * p1, p3 - p0 + h * p3
-    rows = np.stack([np.column_stack([across, g]), np.column_stack([down, h]), np.insert(p0, 2, 1.0, axis=1)], axis=2)
-    u, v = (template / TEMPLATE_UNITS).T.astype(np.float32)
-    x, y, depth = (a * u + b * v + c for a, b, c in rows.astype(np.float32).transpose(1, 2, 0)[..., None])
-    return np.stack([x, y], axis=2) / np.maximum(depth, np.float32(1e-6))[:, :, None]
+@compiled(CUBE, MATRIX)
+def points_in(quads: Array, template: Array) -> Array:
+    """Return where template points (S, 2) lie (Q, S, 2) when each quad (Q, 4, 2) is the outer square."""
+    at = np.empty((len(quads), len(template), 2))
+    for q in range(len(quads)):
+        H = plane_of(quads[q])
+        for i in range(len(template)):
+            u, v = template[i, 0] / TEMPLATE_UNITS, template[i, 1] / TEMPLATE_UNITS
+            depth = max(H[2, 0] * u + H[2, 1] * v + 1, LEAST_DEPTH)
+            at[q, i, 0] = (H[0, 0] * u + H[0, 1] * v + H[0, 2]) / depth
+            at[q, i, 1] = (H[1, 0] * u + H[1, 1] * v + H[1, 2]) / depth
+    return at
 
 
 def _turned(reading: Reading, quad: Array) -> Candidate:

@@ -186,13 +186,11 @@ def _gauss_newton(warp: W, seen: EdgePoints, known: _Pulls, use: Mask) -> tuple[
     solution.  One step does where the warp is as good as linear; a small square seen nearly square-on needs more, for
     its tilt shows in the second order.
     """
-    template, used = template_of(seen.edge).points, np.flatnonzero(use)
-    normal = seen.lie.normal.reshape(2, -1)
-    offset_px = (seen.offset_px - known.pull_px).ravel()
-    places_px = seen.lie.predicted_px.reshape(2, -1) + offset_px * normal
-    share = np.minimum(1.0, seen.lie.length_px / (POINTS_PER_EDGE * CORRELATION_LENGTH_PX)).repeat(POINTS_PER_EDGE)
-    parts = (offset_px, known.keen.ravel(), share, known.variance.ravel(), known.growth.ravel())
-    left, keen, share, variance, growth = (part[used] for part in parts)
+    template, lie = template_of(seen.edge).points, seen.lie
+    normal, at_px = lie.normal.reshape(2, -1), lie.predicted_px.reshape(2, -1)
+    places_px = _moved(at_px, normal, seen.offset_px, known.pull_px)
+    used, parts = _kept(use, seen.offset_px, lie.length_px, *known[:-1])
+    left, keen, share, variance, growth = parts
     prior_sigma = np.concatenate([warp.step_sigma(), NUISANCE_SIGMA])
     for _ in range(MAX_STEPS):
         A = _felt(warp.slopes(template, normal), used, growth)
@@ -205,6 +203,37 @@ def _gauss_newton(warp: W, seen: EdgePoints, known: _Pulls, use: Mask) -> tuple[
         if surprise_px < LINEAR_PX:
             break
     return warp, A, left, solution
+
+
+@compiled(MATRIX, MATRIX, MATRIX, MATRIX)
+def _moved(at_px: Array, normal: Array, offset_px: Array, pull_px: Array) -> Array:
+    """Return where all points (2, E M) were measured: moved along normals (2, E M) by their offsets (E, M)."""
+    places_px, points = np.empty(at_px.shape), offset_px.shape[1]
+    for k in range(at_px.shape[1]):
+        moved = offset_px[k // points, k % points] - pull_px[k // points, k % points]
+        places_px[0, k], places_px[1, k] = at_px[0, k] + moved * normal[0, k], at_px[1, k] + moved * normal[1, k]
+    return places_px
+
+
+@compiled(FLAG_MATRIX, MATRIX, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX)
+def _kept(
+    use: Mask, offset_px: Array, length_px: Array, pull_px: Array, variance: Array, keen: Array, growth: Array
+) -> tuple[NDArray[np.int64], Array]:
+    """Return which N of all points are used, and their offsets, keenness, shares, variances and growth (5, N).
+
+    The share is of what a point of an edge that looks short tells for itself.
+    """
+    edges, points = use.shape
+    count, i = np.count_nonzero(use), 0
+    used, parts = np.empty(count, np.int64), np.empty((5, count))
+    for e in range(edges):
+        for m in range(points):
+            if use[e, m]:
+                used[i], parts[0, i] = points * e + m, offset_px[e, m] - pull_px[e, m]
+                parts[1, i], parts[3, i], parts[4, i] = keen[e, m], variance[e, m], growth[e, m]
+                parts[2, i] = min(1.0, length_px[e] / (points * CORRELATION_LENGTH_PX))
+                i += 1
+    return used, parts
 
 
 @compiled(MATRIX, INDICES, VECTOR)
@@ -301,15 +330,25 @@ def _pulls(seen: EdgePoints, near: Crossings | None, use: Mask) -> _Pulls:
     """Return what is known of the pulls on points to ``use`` (E, M), nothing without ``near``."""
     lie = seen.lie
     if near is None:
-        off_px = PULL_PX * (SHARP_REACH_PX / np.maximum(lie.reach_px, 1e-3)) ** 2 + PULL_FLOOR_PX
-        variance = POINTS_PER_EDGE * (np.square(off_px)[:, None] + np.square(seen.clipped_px))
-        return _Pulls(np.zeros(use.shape), variance, np.ones(use.shape), np.zeros(use.shape), np.zeros(use.shape, bool))
+        return _Pulls(*_unknown(lie.reach_px, seen.clipped_px))
     blur_px = _blur_alone(seen, near)
     pulled = np.flatnonzero(use.any(axis=1) & (lie.reach_px < FAR_REACH * blur_px))
     pull_px, keen = np.zeros(use.shape), np.ones(use.shape)
     if len(pulled):
         pull_px[pulled], keen[pulled] = pull(near, seen.edge[pulled], lie.unit_px[pulled], blur_px)
     return _Pulls(*_known(pull_px, keen, blur_px, seen.edge, lie.margin_px, seen.clipped_px))
+
+
+@compiled(VECTOR, MATRIX)
+def _unknown(reach_px: Array, clipped_px: Array) -> tuple[Array, Array, Array, Array, Mask]:
+    """Return that no pull (E, M) is known, but how large it may be: the fields of ``_Pulls``."""
+    variance = np.empty(clipped_px.shape)
+    for e in range(len(reach_px)):
+        off_px = PULL_PX * (SHARP_REACH_PX / max(reach_px[e], 1e-3)) ** 2 + PULL_FLOOR_PX
+        for m in range(clipped_px.shape[1]):
+            variance[e, m] = POINTS_PER_EDGE * (off_px**2 + clipped_px[e, m] ** 2)
+    none = np.zeros(clipped_px.shape)
+    return none, variance, np.ones(clipped_px.shape), none, np.zeros(clipped_px.shape, np.bool_)
 
 
 @compiled(MATRIX, MATRIX, REAL, INDICES, MATRIX, MATRIX)

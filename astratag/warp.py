@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 OUTSIDE_PX = -1e4
 """Where points behind the camera are said to be: far outside every image."""
 BEND_STEP_PX = 3.0
+LEAST_AREA = 1e-9
 LEAST_DEPTH = 1e-6
 """Homogeneous depth below which a point of a plane is at infinity or behind the camera."""
 NEAREST_SIDES = 1e-3
@@ -62,11 +63,6 @@ class FittedWarp(Protocol):
         ...
 
 
-def _normalised(template: Array) -> Array:
-    """Return template points with the print spanning -1..1: keeps the normal equations well conditioned."""
-    return np.asarray(template) / (TEMPLATE_UNITS / 2) - 1.0
-
-
 def _listed(template: Array) -> Array:
     """Return template points (..., 2) as a list (N, 2) in C order."""
     return np.ascontiguousarray(template, dtype=float).reshape(-1, 2)
@@ -81,9 +77,9 @@ class HomographyWarp:
     @classmethod
     def from_points(cls, template: Array, points_px: Array) -> HomographyWarp:
         """Return the homography through four points (4, 2), or nearest to more (N, 2)."""
-        source = _normalised(template)
+        source = np.asarray(template) / (TEMPLATE_UNITS / 2) - 1.0  # -1..1 keeps the normal equations well conditioned
         if len(source) == 4:
-            H = cv2.getPerspectiveTransform(source.astype(np.float32), points_px.astype(np.float32))
+            H = plane_between(source, np.ascontiguousarray(points_px, dtype=float))
         else:
             H = cv2.findHomography(source, points_px)[0]
         return cls(H / H[2, 2])
@@ -241,6 +237,42 @@ class PoseWarp:
     def curved(self) -> bool:
         """Return whether the surface is anything but a plane."""
         return not isinstance(self.surface, Flat)
+
+
+@compiled(MATRIX)
+def plane_of(quad: Array) -> Array:
+    """Return the homography (3, 3) that takes the unit square, clockwise from the origin, to a quad (4, 2).
+
+    Heckbert, "Fundamentals of texture mapping and image warping", 1989.  Zeros in its last row where three corners are
+    on a line.
+    """
+    (x0, y0), (x1, y1), (x2, y2), (x3, y3) = quad
+    ax, ay, bx, by = x1 - x2, y1 - y2, x3 - x2, y3 - y2
+    sx, sy = x0 - x1 + x2 - x3, y0 - y1 + y2 - y3
+    area, g, h = ax * by - ay * bx, 0.0, 0.0
+    if abs(area) > LEAST_AREA:
+        g, h = (sx * by - sy * bx) / area, (ax * sy - ay * sx) / area
+    H = np.empty((3, 3))
+    H[0, 0], H[0, 1], H[0, 2] = x1 - x0 + g * x1, x3 - x0 + h * x3, x0
+    H[1, 0], H[1, 1], H[1, 2] = y1 - y0 + g * y1, y3 - y0 + h * y3, y0
+    H[2, 0], H[2, 1], H[2, 2] = g, h, 1.0
+    return H
+
+
+@compiled(MATRIX, MATRIX)
+def plane_between(quad: Array, other: Array) -> Array:
+    """Return the homography (3, 3), up to its scale, that takes one quad (4, 2) to another (4, 2)."""
+    A, H = plane_of(quad), plane_of(other)
+    adjugate, product = np.empty((3, 3)), np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            k, m, n, o = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
+            adjugate[j, i] = A[k, n] * A[m, o] - A[k, o] * A[m, n]
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                product[i, j] += H[i, k] * adjugate[k, j]
+    return product
 
 
 @compiled(MATRIX, MATRIX)
