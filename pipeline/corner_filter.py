@@ -238,11 +238,12 @@ class CornerFilter:
         log_likelihood = -0.5 * nis - float(np.log(np.diag(L)).sum())
         return Update(nis, len(whitened), log_likelihood, whitened)
 
-    def widen(self, other: CornerFilter, probability: float) -> None:
-        """Cover also the other filter's motion, which is the right one with a (small) probability."""
+    def merged(self, other: CornerFilter, probability: float) -> CornerFilter:
+        """Return the mean of both, of which the other is the right one with a probability, with its covariance."""
         apart = self.motion.error_of(other.motion)
-        own, others = self.covariance, other.covariance
-        self._P = (1 - probability) * own + probability * (others + np.outer(apart, apart))
+        spread = probability * (1 - probability) * np.outer(apart, apart)
+        P = (1 - probability) * self._P + probability * other._P + spread
+        return CornerFilter(self.motion.moved(probability * apart), P, self.noise)
 
     def distrust_pose(self, factor: float) -> None:
         """Multiply the standard deviations of position and attitude."""

@@ -1,7 +1,8 @@
 """The poses that explain what is seen: one, or two while a planar marker leaves it open which way it is tilted.
 
 Each pose is a filter of its own; measurements move their probabilities until one is so much likelier that the other
-is dropped, or until the two have become one.
+is dropped, or until the two have come to the same.  Two that are merely near for their uncertainty are published as one
+that covers both, and both are followed on: which of them is right is left to the evidence, not to where it began.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from astratag.transforms import inverse
 from pipeline.corner_filter import CORNER_DOF, CornerFilter, Eye, SeenLayer, Update
-from pipeline.dynamics import ATTITUDE
+from pipeline.dynamics import ATTITUDE, OwnMotion
 from pipeline.mission import FilterSection
 
 Array = NDArray[np.float64]
@@ -23,6 +24,8 @@ START_MISFIT = 25.0
 """A first pose whose squared residuals are this many times what their noise explains is not believed."""
 FIRST_LOOK = 4.0
 """How many times less certain a pose is begun with than its corners promise: a search is cruder than tracking."""
+SAME_POSE = 0.02
+"""Squared distance, as below, from which on two filters have come to the same and one is enough."""
 ONE_MODE = 2.0
 """Squared distance, in units of the summed covariances, below which two equal Gaussians have a single mode: each is
 then within two of its own standard deviations of the other."""
@@ -33,6 +36,7 @@ class HypothesisBank:
 
     def __init__(self, filters: list[CornerFilter], log_weights: list[float], noise: FilterSection):
         self.filters, self._log_weights, self._noise = filters, log_weights, noise
+        self._is_one_mode = False
         self._sort_and_prune()
 
     @classmethod
@@ -52,12 +56,14 @@ class HypothesisBank:
             return None
         best_misfit, best = found[0]
         scale = max(1.0, best_misfit / dof)
-        rival = next((pair for pair in found[1:] if not is_one_mode(best, pair[1])), None)
-        for candidate in (best,) if rival is None else (best, rival[1]):
-            candidate.distrust_pose(FIRST_LOOK)
+        rival = next((pair for pair in found[1:] if distance(best, pair[1]) > SAME_POSE), None)
         if rival is None:
-            return cls([best], [0.0], noise)
-        return cls([best, rival[1]], [-best_misfit / scale / 2, -rival[0] / scale / 2], noise)
+            bank = cls([best], [0.0], noise)
+        else:
+            bank = cls([best, rival[1]], [-best_misfit / scale / 2, -rival[0] / scale / 2], noise)
+        for candidate in bank.filters:
+            candidate.distrust_pose(FIRST_LOOK)
+        return bank
 
     @property
     def best(self) -> CornerFilter:
@@ -65,9 +71,16 @@ class HypothesisBank:
         return self.filters[0]
 
     @property
+    def estimate(self) -> CornerFilter:
+        """Return what to publish: the likeliest pose, or the mean of two that are one mode, covering both."""
+        if len(self.filters) == 1 or not self._is_one_mode:
+            return self.best
+        return self.best.merged(self.filters[1], 1.0 - self.probability)
+
+    @property
     def is_ambiguous(self) -> bool:
-        """Tell whether two poses are still possible."""
-        return len(self.filters) > 1
+        """Tell whether two poses are still possible that are not one for their uncertainty."""
+        return len(self.filters) > 1 and not self._is_one_mode
 
     @property
     def probability(self) -> float:
@@ -77,12 +90,15 @@ class HypothesisBank:
 
     def copy(self) -> HypothesisBank:
         """Return a bank of its own in the same state."""
-        return HypothesisBank([f.copy() for f in self.filters], list(self._log_weights), self._noise)
+        bank = HypothesisBank.__new__(HypothesisBank)
+        bank.filters, bank._log_weights = [f.copy() for f in self.filters], list(self._log_weights)
+        bank._noise, bank._is_one_mode = self._noise, self._is_one_mode
+        return bank
 
-    def predict(self, dt_s: float, unseen_s: float = 0.0) -> None:
+    def predict(self, dt_s: float, unseen_s: float = 0.0, own: OwnMotion | None = None) -> None:
         """Let ``dt_s`` seconds pass, at the end of which nothing was measured for ``unseen_s`` seconds."""
         for hypothesis in self.filters:
-            hypothesis.predict(dt_s, unseen_s)
+            hypothesis.predict(dt_s, unseen_s, own)
 
     def gate(self, layers: Sequence[SeenLayer], eye: Eye) -> Array:
         """Return the normalised innovation squared of each layer under the pose that it fits best."""
@@ -104,26 +120,29 @@ class HypothesisBank:
         scale = max(1.0, min(update.nis / update.dof for update, _, _ in kept))
         self.filters = [hypothesis for _, hypothesis, _ in kept]
         self._log_weights = [weight + update.log_likelihood / scale for update, _, weight in kept]
-        updates = {id(hypothesis): update for update, hypothesis, _ in kept}
+        likeliest = kept[int(np.argmax(self._log_weights))][0]
         self._sort_and_prune()
-        return updates[id(self.best)]
+        return likeliest
 
     def _sort_and_prune(self) -> None:
         order = np.argsort([-weight for weight in self._log_weights], kind="stable")
         self.filters = [self.filters[k] for k in order]
         self._log_weights = [self._log_weights[k] - self._log_weights[order[0]] for k in order]
-        unlikely = self._log_weights[-1] < -np.log(self._noise.ambiguity_ratio)
-        if self.is_ambiguous and (unlikely or is_one_mode(*self.filters)):
-            if not unlikely:
-                self.best.widen(self.filters[1], 1.0 - self.probability)
+        if len(self.filters) == 1:
+            return
+        apart = distance(*self.filters)
+        self._is_one_mode = apart < ONE_MODE
+        if apart < SAME_POSE:
+            self.filters[0] = self.estimate
+        if apart < SAME_POSE or self._log_weights[-1] < -np.log(self._noise.ambiguity_ratio):
             del self.filters[1:], self._log_weights[1:]
 
 
-def is_one_mode(a: CornerFilter, b: CornerFilter) -> bool:
-    """Tell whether two filters' attitudes are so near, for their uncertainty, that they are one pose."""
+def distance(a: CornerFilter, b: CornerFilter) -> float:
+    """Return the squared distance between two filters' attitudes, in units of their summed covariances."""
     apart = a.motion.error_of(b.motion)[ATTITUDE]
     spread = a.covariance[ATTITUDE, ATTITUDE] + b.covariance[ATTITUDE, ATTITUDE]
-    return float(apart @ np.linalg.solve(spread, apart)) < ONE_MODE
+    return float(apart @ np.linalg.solve(spread, apart))
 
 
 def mirrored_pose(T_cam_marker: Array) -> Array:

@@ -226,7 +226,7 @@ class PoseFilter:
         frame.log(
             Log.INFO,
             f"acquired marker {marker.id}, {np.linalg.norm(poses[0][:3, 3]):.3f} m from the camera, "
-            f"{len(self._bank.filters)} possible {'poses' if self._bank.is_ambiguous else 'pose'}",
+            f"{len(self._bank.filters)} possible {'pose' if len(self._bank.filters) == 1 else 'poses'}",
         )
 
     def _lose_when_old(self, frame: Frame) -> None:
@@ -269,7 +269,8 @@ class PoseFilter:
                 rejections=frame.rejections,
             )
             return [state, *frame.events]
-        motion = bank.best.motion
+        estimate = bank.estimate
+        motion = estimate.motion
         T_chaser_target = motion.pose_chaser_target()
         v, omega = motion.v_chaser_target_m_s, motion.omega_chaser_target_in_target_rad_s
         state = RelativeState(
@@ -278,7 +279,7 @@ class PoseFilter:
             T_chaser_target=pose_message(T_chaser_target),
             v_chaser_target_m_s=vector_message(v),
             omega_chaser_target_in_target_rad_s=vector_message(omega),
-            covariance=bank.best.message_covariance().ravel().tolist(),
+            covariance=estimate.message_covariance().ravel().tolist(),
             nis=None if frame.update is None else frame.update.nis,
             nis_dof=0 if frame.update is None else frame.update.dof,
             age_s=self._age_s(frame.t_ns),
