@@ -215,8 +215,9 @@ class PoseFilter:
         if not poses:
             frame.rejections.append(f"pose: marker {marker.id} came without one to start from")
             return
-        guesses = guesses_in_chaser(poses, self._eye, inverse(marker.T_target_marker.matrix()))
-        self._bank = HypothesisBank.start(guesses, layers, self._eye, self._settings)
+        T_target_marker = marker.T_target_marker.matrix()
+        guesses = guesses_in_chaser(poses, self._eye, inverse(T_target_marker))
+        self._bank = HypothesisBank.start(guesses, layers, self._eye, self._settings, T_target_marker)
         if self._bank is None:
             frame.rejections.append(f"pose: none fits the corners of marker {marker.id}")
             return
