@@ -1,14 +1,15 @@
 """The poses that explain what is seen: one, or two while a planar marker leaves it open which way it is tilted.
 
 Each pose is a filter of its own; measurements move their probabilities until one is so much likelier that the other
-is dropped, or until the two have come to the same.  Two that are merely near for their uncertainty are published as one
-that covers both, and both are followed on.  A pose that has been so near its mirror image that the two were one is
-open again once they part: which way it is tilted is left to the evidence, not to where it began.
+is dropped, or until the two have come to the same.  Two that are near, for their uncertainty or at all, are published as
+one that covers both.  Which way a print is tilted is left to the evidence of the last looks, never to where it began: a
+pose counts as the only one while its mirror image fits them so much worse, and is ambiguous otherwise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +23,11 @@ from pipeline.mission import FilterSection
 Array = NDArray[np.float64]
 
 POSE_DOF = 6
+LOOKS = 100
+"""How many of the last looks at the corners tell a pose from its mirror image."""
+SETTLED = 4.0
+"""Evidence so many times what is asked for is looked at again only now and then."""
+RECHECK = 5
 START_MISFIT = 25.0
 """A first pose whose squared residuals are this many times what their noise explains is not believed."""
 FIRST_LOOK = 4.0
@@ -37,14 +43,23 @@ class HypothesisBank:
     """One or two filters with their logarithmic weights, the likeliest first."""
 
     def __init__(
-        self, filters: list[CornerFilter], log_weights: list[float], noise: FilterSection, T_target_marker: Array
+        self,
+        filters: list[CornerFilter],
+        log_weights: list[float],
+        noise: FilterSection,
+        T_target_marker: Array,
+        eye: Eye,
     ):
         """``T_target_marker`` is where the print lies that could be tilted the other way."""
         self.filters, self._log_weights, self._noise = filters, log_weights, noise
-        self._T_target_marker = T_target_marker
+        self._T_target_marker, self._eye = T_target_marker, eye
         self._is_one_mode = False
-        self._is_open = len(filters) == 1
-        """There is one pose, but which way it is tilted was never decided."""
+        self._against, self._looks = 0.0, 0.0
+        """Half of how much worse the likeliest pose's mirror image fits than itself, summed over the last looks."""
+        self._evidence = 0.0
+        """The same as a logarithmic likelihood ratio."""
+        self._enough = float(np.log(noise.ambiguity_ratio))
+        self._unchecked = 0
         self._sort_and_prune()
 
     @classmethod
@@ -72,10 +87,11 @@ class HypothesisBank:
         scale = max(1.0, best_misfit / dof)
         rival = next((pair for pair in found[1:] if distance(best, pair[1]) > SAME_POSE), None)
         if rival is None:
-            bank = cls([best], [0.0], noise, T_target_marker)
+            bank = cls([best], [0.0], noise, T_target_marker, eye)
         else:
             weights = [-best_misfit / scale / 2, -rival[0] / scale / 2]
-            bank = cls([best, rival[1]], weights, noise, T_target_marker)
+            bank = cls([best, rival[1]], weights, noise, T_target_marker, eye)
+        bank._weigh_mirrored(bank._worse_mirrored(layers, eye) / scale, layers, eye)
         for candidate in bank.filters:
             candidate.distrust_pose(FIRST_LOOK)
         return bank
@@ -87,28 +103,33 @@ class HypothesisBank:
 
     @property
     def estimate(self) -> CornerFilter:
-        """Return what to publish: the likeliest pose, or the mean of two that are one mode, covering both."""
-        if len(self.filters) == 1 or not self._is_one_mode:
+        """Return what to publish: the likeliest pose, or the mean of two that are near, covering both."""
+        if self.is_ambiguous or self._is_sure:
             return self.best
-        return self.best.merged(self.filters[1], 1.0 - self.probability)
+        rival = self.filters[1] if len(self.filters) > 1 else mirrored(self.best, self._T_target_marker, self._eye)
+        return self.best.merged(rival, 1.0 - self.probability)
 
     @property
     def is_ambiguous(self) -> bool:
-        """Tell whether two poses are still possible that are not one for their uncertainty."""
-        return len(self.filters) > 1 and not self._is_one_mode
+        """Tell whether two poses are still possible that are not one, for their uncertainty or at all."""
+        return not (self._is_sure or self._is_one_mode)
+
+    @property
+    def _is_sure(self) -> bool:
+        return len(self.filters) == 1 and self._evidence >= self._enough
 
     @property
     def probability(self) -> float:
         """Return that of the likeliest pose."""
+        if len(self.filters) == 1:
+            return float(1.0 / (1.0 + np.exp(-max(self._evidence, 0.0))))
         weights = np.exp(np.array(self._log_weights) - self._log_weights[0])
         return float(1.0 / weights.sum())
 
     def copy(self) -> HypothesisBank:
         """Return a bank of its own in the same state."""
-        bank = HypothesisBank.__new__(HypothesisBank)
+        bank = copy(self)
         bank.filters, bank._log_weights = [f.copy() for f in self.filters], list(self._log_weights)
-        bank._noise, bank._T_target_marker = self._noise, self._T_target_marker
-        bank._is_one_mode, bank._is_open = self._is_one_mode, self._is_open
         return bank
 
     def predict(self, dt_s: float, unseen_s: float = 0.0, own: OwnMotion | None = None) -> None:
@@ -126,6 +147,9 @@ class HypothesisBank:
         Where even the better pose fits worse than the corner noise explains, likelihoods count in units of its own
         misfit, so that an underestimated noise cannot decide between the poses.
         """
+        is_due = self._evidence < SETTLED * self._enough or self._unchecked >= RECHECK
+        self._unchecked = 0 if is_due else self._unchecked + 1
+        worse = self._worse_mirrored(layers, eye) if is_due else None
         kept = [
             (update, hypothesis, weight)
             for hypothesis, weight in zip(self.filters, self._log_weights, strict=True)
@@ -138,37 +162,48 @@ class HypothesisBank:
         self._log_weights = [weight + update.log_likelihood / scale for update, _, weight in kept]
         likeliest = kept[int(np.argmax(self._log_weights))][0]
         self._sort_and_prune()
-        if len(self.filters) == 1:
-            self._look_for_a_rival(layers, eye, scale)
+        if worse is not None:
+            self._weigh_mirrored(worse / scale, layers, eye)
         return likeliest
 
-    def _look_for_a_rival(self, layers: Sequence[SeenLayer], eye: Eye, scale: float) -> None:
-        """Follow the mirror image too, where it has parted from a pose with which it was one, and fits as well."""
-        if mirror_distance(self.best, self._T_target_marker, eye) < ONE_MODE:
-            self._is_open = True
+    def _worse_mirrored(self, layers: Sequence[SeenLayer], eye: Eye) -> float:
+        """Return how much larger the squared residuals are under the mirror image of the likeliest pose."""
+        image = mirrored(self.best, self._T_target_marker, eye)
+        return image.misfit(layers, eye) - self.best.misfit(layers, eye)
+
+    def _weigh_mirrored(self, worse: float, layers: Sequence[SeenLayer], eye: Eye) -> None:
+        """Take in what a look says against the mirror image, and follow that too where it fits better.
+
+        Corners that are off for long by ``corner_bias_px`` repeat themselves: many looks then count like few.
+        """
+        fade = 1 - 1 / LOOKS
+        self._against, self._looks = fade * self._against + worse / 2, fade * self._looks + 1
+        sigma_px = min(layer.sigma_px for layer in layers)
+        self._evidence = self._against / (1 + self._looks * (self._noise.corner_bias_px / sigma_px) ** 2)
+        if len(self.filters) > 1:
             return
-        if not self._is_open:
+        image = mirrored(self.best, self._T_target_marker, eye)
+        self._is_one_mode = is_one_mode(self.best, image, self._noise)
+        if self._evidence > 0 or self._is_one_mode:
             return
-        self._is_open = False
-        rival = mirrored(self.best, self._T_target_marker, eye)
-        rival.distrust_pose(FIRST_LOOK)
-        if rival.update(layers, eye) is None:
-            return
-        worse = rival.misfit(layers, eye) - self.best.misfit(layers, eye)
-        self.filters.append(rival)
-        self._log_weights.append(-worse / scale / 2)
-        self._sort_and_prune()
+        image.distrust_pose(FIRST_LOOK)
+        if image.update(layers, eye) is not None:
+            self.filters.append(image)
+            self._log_weights.append(0.0)
+            self._sort_and_prune()
 
     def _sort_and_prune(self) -> None:
         order = np.argsort([-weight for weight in self._log_weights], kind="stable")
+        if order[0] != 0:
+            self._against, self._evidence = -self._against, -self._evidence
         self.filters = [self.filters[k] for k in order]
         self._log_weights = [self._log_weights[k] - self._log_weights[order[0]] for k in order]
         if len(self.filters) == 1:
             return
         apart = distance(*self.filters)
-        self._is_one_mode = apart < ONE_MODE
+        self._is_one_mode = is_one_mode(*self.filters, self._noise)
         if apart < SAME_POSE:
-            self._is_open, self.filters[0] = True, self.estimate
+            self.filters[0] = self.estimate
         if apart < SAME_POSE or self._log_weights[-1] < -np.log(self._noise.ambiguity_ratio):
             del self.filters[1:], self._log_weights[1:]
 
@@ -178,6 +213,12 @@ def distance(a: CornerFilter, b: CornerFilter) -> float:
     apart = a.motion.error_of(b.motion)[ATTITUDE]
     spread = a.covariance[ATTITUDE, ATTITUDE] + b.covariance[ATTITUDE, ATTITUDE]
     return float(apart @ np.linalg.solve(spread, apart))
+
+
+def is_one_mode(a: CornerFilter, b: CornerFilter, noise: FilterSection) -> bool:
+    """Tell whether two filters' attitudes are so near that a covariance about their mean may stand for both."""
+    apart_rad = float(np.linalg.norm(a.motion.error_of(b.motion)[ATTITUDE]))
+    return apart_rad < noise.one_tilt_rad or distance(a, b) < ONE_MODE
 
 
 MIRROR = np.diag([1.0, 1.0, -1.0])
@@ -192,17 +233,6 @@ def mirrored_pose(T_cam_marker: Array) -> Array:
     sight = T[:3, 3] / np.linalg.norm(T[:3, 3])
     T[:3, :3] = (np.eye(3) - 2 * np.outer(sight, sight)) @ T[:3, :3] @ MIRROR
     return T
-
-
-def mirror_distance(one: CornerFilter, T_target_marker: Array, eye: Eye) -> float:
-    """Return ``distance`` between a filter and its mirror image."""
-    T_cam_marker = eye.T_cam_chaser @ one.motion.pose_chaser_target() @ T_target_marker
-    sight = T_cam_marker[:3, :3].T @ T_cam_marker[:3, 3]
-    across = np.hypot(sight[0], sight[1])
-    turn_rad = 2 * np.arctan2(across, abs(sight[2]))
-    axis_marker = np.array([sight[1], -sight[0], 0.0]) / max(across, np.finfo(float).tiny)
-    apart = turn_rad * T_target_marker[:3, :3] @ axis_marker
-    return float(apart @ np.linalg.solve(2 * one.covariance[ATTITUDE, ATTITUDE], apart))
 
 
 def mirrored(one: CornerFilter, T_target_marker: Array, eye: Eye) -> CornerFilter:

@@ -195,6 +195,8 @@ class FilterSection(Section):
     edge_bias_px: float = Field(default=0.03, ge=0)
     """How far the edges of every black square may be measured outside or inside their place, all by the same."""
     edge_bias_correlation_s: float = Field(default=5.0, gt=0)
+    corner_bias_px: float = Field(default=0.02, ge=0)
+    """How far each corner may be off by itself for long: repeated looks then tell two poses apart no better."""
     corner_floor_px: float = Field(default=0.03, gt=0)
     """No corner is believed better than this."""
     scale_sigma: float = Field(default=0.0, ge=0)
@@ -209,6 +211,8 @@ class FilterSection(Section):
     """Share of true measurements that a gate lets through."""
     ambiguity_ratio: float = Field(default=1e4, gt=1)
     """How many times likelier one of two poses must become before the other is dropped."""
+    one_tilt_rad: float = Field(default=float(np.deg2rad(2.0)), ge=0)
+    """Two poses turned by less against each other are published as one that covers both."""
     reset_after_frames: int = Field(default=5, gt=0)
     """Frames refused in a row, all measurements or the stamp, that make the filter start again."""
     coast_s: float = Field(default=5.0, gt=0)
