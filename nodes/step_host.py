@@ -27,6 +27,10 @@ class StepWork:
         self._mission = mission
         self._step = spec.build(mission)
         self._tick = None if lossless else getattr(self._step, "tick", None)
+        period_s = getattr(self._step, "tick_period_s", None)
+        self._quiet_ns, self._tick_ns = QUIET_NS, TICK_NS
+        if period_s is not None:
+            self._quiet_ns = self._tick_ns = round(period_s * 1e9)
         self._sequence: int | None = None
         self._t_last_ns = 0
 
@@ -45,9 +49,9 @@ class StepWork:
 
     def idle(self, t_ns: int) -> Iterable[Envelope]:
         """Tell a live step the time when its input has dried up."""
-        if self._tick is None or self._sequence is None or t_ns - self._t_last_ns < QUIET_NS:
+        if self._tick is None or self._sequence is None or t_ns - self._t_last_ns < self._quiet_ns:
             return []
-        self._t_last_ns = t_ns - QUIET_NS + TICK_NS
+        self._t_last_ns = t_ns - self._quiet_ns + self._tick_ns
         return self._wrap(self._tick(t_ns), Stamp(self._sequence, t_ns, t_ns))
 
     def close(self) -> None:

@@ -1,9 +1,9 @@
 """The poses that explain what is seen: one, or two while a planar marker leaves it open which way it is tilted.
 
 Each pose is a filter of its own; measurements move their probabilities until one is so much likelier that the other
-is dropped, or until the two have come to the same.  Two that are near, for their uncertainty or at all, are published as
-one that covers both.  Which way a print is tilted is left to the evidence of the last looks, never to where it began: a
-pose counts as the only one while its mirror image fits them so much worse, and is ambiguous otherwise.
+is dropped, or until the two have come to the same.  Two that are near, for their uncertainty or at all, are published
+as one that covers both.  Which way a print is tilted is left to the evidence of the last looks, never to where it
+began: a pose counts as the only one while its mirror image fits them so much worse, and is ambiguous otherwise.
 """
 
 from __future__ import annotations
@@ -137,6 +137,11 @@ class HypothesisBank:
         for hypothesis in self.filters:
             hypothesis.predict(dt_s, unseen_s, own)
 
+    def observe_from(self, before: OwnMotion, now: OwnMotion) -> None:
+        """Have the chaser's own rate change, which is known."""
+        for hypothesis in self.filters:
+            hypothesis.motion = hypothesis.motion.observed_from(before, now)
+
     def gate(self, layers: Sequence[SeenLayer], eye: Eye) -> Array:
         """Return the normalised innovation squared of each layer under the pose that it fits best."""
         return np.min([hypothesis.gate(layers, eye) for hypothesis in self.filters], axis=0)
@@ -201,7 +206,7 @@ class HypothesisBank:
         if len(self.filters) == 1:
             return
         apart = distance(*self.filters)
-        self._is_one_mode = is_one_mode(*self.filters, self._noise)
+        self._is_one_mode = is_one_mode(self.filters[0], self.filters[1], self._noise)
         if apart < SAME_POSE:
             self.filters[0] = self.estimate
         if apart < SAME_POSE or self._log_weights[-1] < -np.log(self._noise.ambiguity_ratio):

@@ -215,6 +215,10 @@ class FilterSection(Section):
     """Two poses turned by less against each other are published as one that covers both."""
     reset_after_frames: int = Field(default=5, gt=0)
     """Frames refused in a row, all measurements or the stamp, that make the filter start again."""
+    history_s: float = Field(default=1.0, ge=0)
+    """A frame that comes later than others by up to this is taken at its own time, and they again after it."""
+    output_rate_hz: float | None = Field(default=None, gt=0, le=1000)
+    """Live: propagated states at this rate between frames; None: ten a second, once frames stay away."""
     coast_s: float = Field(default=5.0, gt=0)
     """Longest propagation without measurements before LOST."""
 
