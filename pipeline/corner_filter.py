@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,7 +126,7 @@ class CornerFilter:
         self._looked: Look | None = None
 
     @classmethod
-    def start(cls, T_chaser_target: Array, range_m: float, noise: FilterSection) -> CornerFilter:
+    def start(cls, T_chaser_target: Array, range_m: float, noise: FilterSection) -> Self:
         """Return a filter at a guessed pose, ``range_m`` from the camera, as good as ignorant of it."""
         sigma = np.empty(STATES)
         sigma[POSITION], sigma[ATTITUDE] = START_RANGE_SHARE * range_m, START_ATTITUDE_RAD
@@ -138,7 +139,7 @@ class CornerFilter:
         """Return the covariance (16, 16) of the error state."""
         return self._P
 
-    def copy(self) -> CornerFilter:
+    def copy(self) -> Self:
         """Return a filter of its own in the same state."""
         return type(self)(self.motion, self._P, self.noise)
 

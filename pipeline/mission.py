@@ -197,9 +197,9 @@ class FilterSection(Section):
     edge_bias_correlation_s: float = Field(default=5.0, gt=0)
     corner_bias_px: float = Field(default=0.02, ge=0)
     """How far each corner may be off by itself for long: repeated looks then tell two poses apart no better."""
-    corner_floor_px: float = Field(default=0.03, gt=0)
+    corner_floor_px: float = Field(default=0.02, gt=0)
     """No corner is believed better than this."""
-    scale_sigma: float = Field(default=0.0, ge=0)
+    scale_sigma: float = Field(default=2e-4, ge=0)
     """How far the focal length, as a share of itself, may be off, or the marker's size: constant, considered."""
     image_shift_px: float = Field(default=0.0, ge=0)
     """How far all pictures may be shifted alike, by a principal point that is off: constant, considered."""

@@ -106,8 +106,14 @@ class PoseFilter:
         self._own: list[tuple[int, OwnMotion]] = []
         """The chaser's own motion from each time on."""
         self._periods_ns: deque[int] = deque(maxlen=PERIODS_KEPT)
+        self._update: Update | None = None
         self._late_frames = 0
         """Frames in a row stamped before all that is remembered."""
+
+    @property
+    def innovation(self) -> Array | None:
+        """Return the last frame's innovation in its own standard deviations, None when nothing was used."""
+        return None if self._update is None else self._update.whitened
 
     @property
     def tick_period_s(self) -> float | None:
@@ -180,6 +186,7 @@ class PoseFilter:
             frame.t_ns = last_ns
         else:
             self._advance(message, frame)
+        self._update = frame.update
         return self._answer(self._track, frame, self._track.bank)
 
     def _take_late(self, message: Detections, frame: Frame, last_ns: int) -> None:
