@@ -173,6 +173,10 @@ def _euler(omega: Array, inertia: Array) -> Array:
     return -np.cross(omega, inertia * omega) / inertia
 
 
+def _euler_slopes(omega: Array, inertia: Array) -> Array:
+    return (skew(inertia * omega) - skew(omega) * inertia) / inertia[:, None]
+
+
 def _inertial_rate(drift: DriftSection, own: OwnMotion | None) -> Array:
     """Return the chaser's rate in space (3,), chaser axes: its own, and its orbit's about z of the Hill frame."""
     own = OwnMotion.of(drift) if own is None else own
@@ -184,12 +188,13 @@ def _free_rotation_slopes(F: Array, motion: Motion, dt_s: float, drift: DriftSec
     R, omega = motion.R_chaser_target, motion.omega_chaser_target_in_target_rad_s
     J, own_rate = np.array(drift.target_inertia), _inertial_rate(drift, own)
     inertial = omega + R.T @ own_rate
-    G = (skew(J * inertial) - skew(inertial) * J) / J[:, None]
-    R_later, omega_later = free_rotation(R, omega, dt_s, drift, own)
-    turn_rad = (omega + omega_later) / 2 * dt_s
+    middle = inertial + dt_s / 2 * _euler(inertial, J)
+    R_later, _ = free_rotation(R, omega, dt_s, drift, own)
+    half = np.eye(3) + dt_s / 2 * _euler_slopes(inertial, J)
+    spin = np.eye(3) + dt_s * _euler_slopes(middle, J) @ half
+    turn_rad = (middle - exp_so3(-omega * dt_s / 2) @ R.T @ own_rate) * dt_s
     F[ATTITUDE, ATTITUDE] = exp_so3(-turn_rad)
-    F[ATTITUDE, RATE] = dt_s * right_jacobian_so3(turn_rad) @ (np.eye(3) + dt_s / 2 * G)
-    spin = np.eye(3) + dt_s * G + dt_s**2 / 2 * G @ G
+    F[ATTITUDE, RATE] = dt_s * right_jacobian_so3(turn_rad) @ half
     own_before, own_later = skew(R.T @ own_rate), skew(R_later.T @ own_rate)
     F[RATE, ATTITUDE] = spin @ own_before - own_later @ F[ATTITUDE, ATTITUDE]
     F[RATE, RATE] = spin - own_later @ F[ATTITUDE, RATE]

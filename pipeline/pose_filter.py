@@ -282,7 +282,7 @@ class PoseFilter:
             layers = []
             for seen in detection.layers:
                 corners_px = points_array(seen.corners_px)
-                if np.abs(corners_px).max() > FARTHEST_PX or seen.sigma_px > FARTHEST_PX:
+                if not (np.abs(corners_px).max() < FARTHEST_PX and 0 < seen.sigma_px < FARTHEST_PX):
                     frame.rejections.append(f"corners: marker {marker.id} layer {seen.layer} is out of bounds")
                     continue
                 sigma_px = max(seen.sigma_px, self._settings.corner_floor_px)

@@ -1,4 +1,4 @@
-"""Flat markers far away and nearly frontal, which look the same tilted either way: how often the filter is wrongly sure."""
+"""Flat markers far away and nearly frontal, which look the same tilted either way: how often one is wrongly sure."""
 
 from __future__ import annotations
 
