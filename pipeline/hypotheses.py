@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 POSE_DOF = 6
 LOOKS = 100
 """How many of the last looks at the corners tell a pose from its mirror image."""
+FEWEST_LOOKS = 8.0
 SETTLED = 4.0
 """Evidence so many times what is asked for is looked at again only now and then."""
 RECHECK = 5
@@ -111,8 +112,11 @@ class HypothesisBank:
 
     @property
     def is_ambiguous(self) -> bool:
-        """Tell whether two poses are still possible that are not one, for their uncertainty or at all."""
-        return not (self._is_sure or self._is_one_mode)
+        """Tell whether two poses are still possible that are not one, for their uncertainty or at all.
+
+        After a few looks at a distant print both may still be far from where they are going.
+        """
+        return not (self._is_sure or (self._is_one_mode and self._looks > FEWEST_LOOKS))
 
     @property
     def _is_sure(self) -> bool:
