@@ -175,7 +175,7 @@ def plot(found: list[tuple[Case, Samples]], path: Path) -> None:
         ranges = np.array(samples.range_m)
         edges = np.geomspace(case.ranges_m[-1], case.ranges_m[0], 25)
         at = np.digitize(ranges, edges)
-        kept = [k for k in range(1, len(edges)) if (at == k).sum() > 10]
+        kept = [k for k in range(1, len(edges)) if (at == k).any()]
         middle = [float(np.sqrt(edges[k - 1] * edges[k])) for k in kept]
         for axis, index, scale, label in zip(
             line, range(3), (1e3, 1e3, np.rad2deg(1)), ("lateral mm", "axial mm", "tilt deg"), strict=False
