@@ -160,6 +160,7 @@ DOCK_MISSION = Mission(
         acceleration_m_s2=0.03,
         angular_acceleration_rad_s2=0.002,
         edge_bias_px=0.06,
+        corner_floor_px=0.03,
         one_tilt_rad=float(np.deg2rad(20)),
     ),
 )
