@@ -84,6 +84,9 @@ def _parser() -> argparse.ArgumentParser:
     _map(command("map", "nodes.mapping:marker_map", text, example))
     score = command("score", "nodes.tools:score", "Score a recorded run.", "relnav score out/replay/run.mcap")
     score.add_argument("recording", metavar="RUN", type=Path, help="the run.mcap of a replay or a live run")
+    smooth = command("smooth", "nodes.tools:smooth", "Smooth the states of a recorded run.", "relnav smooth run.mcap")
+    smooth.add_argument("recording", metavar="RUN", type=Path, help="the run.mcap of a replay or a live run")
+    smooth.add_argument("--out", type=Path, help="where it goes (default: RUN.smoothed.mcap beside it)")
     example = "relnav recover run.mcap"
     recover = command("recover", "nodes.tools:recover", "Make a recording whole that was cut off.", example)
     recover.add_argument("recording", metavar="FILE", type=Path, help="the truncated recording")

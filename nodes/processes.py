@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from pipeline.steps import STEPS
 from schemas import TOPICS, Topic
-from schemas.topics import CALIBRATION, FRAME, GUIDANCE, HEALTH, STATE, TRUTH
+from schemas.topics import CALIBRATION, CHASER_MOTION, FRAME, GUIDANCE, HEALTH, STATE, TRUTH
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Process:
 _RECORDED = tuple(topic for topic in TOPICS if topic.recorded)
 
 PROCESSES = (
-    Process("source", (), (CALIBRATION, TRUTH, FRAME, GUIDANCE)),
+    Process("source", (), (CALIBRATION, TRUTH, FRAME, GUIDANCE, CHASER_MOTION)),
     *(Process(spec.name, spec.consumes, spec.produces) for spec in STEPS),
     Process("recorder", _RECORDED, (), keeps_all=True),
     Process("viewer", _RECORDED, (), required=False),

@@ -109,6 +109,7 @@ class Shell:
         self._latches = {topic for topic in process.consumes if topic.latched and process.publishes}
         self._held: list[Received] = []
         self._held_since_s = self._idle_due_s = 0.0
+        self._idle_period_s: float = getattr(work, "idle_period_s", IDLE_PERIOD_S)
         self._latched = 0
         self._acknowledged = (-1, 0)
         self._done = False
@@ -130,7 +131,7 @@ class Shell:
                 if not announced and time.monotonic() > join_deadline_s:
                     absent = ", ".join(sorted(self._awaited - self._present))
                     raise NodeError(f"waited {JOIN_PATIENCE_S:.0f} s for {absent}")
-                self._turn(POLL_S)
+                self._turn(min(POLL_S, self._idle_period_s))
             self._drain()
         finally:
             if not self._done:
@@ -225,7 +226,7 @@ class Shell:
         if self._done:
             return
         if now_s >= self._idle_due_s and not self._ended:
-            self._idle_due_s = now_s + IDLE_PERIOD_S
+            self._idle_due_s = now_s + self._idle_period_s
             self._publish(self._work.idle(time.time_ns()))
         if self._options.lossless and self._producers <= self._ended.keys():
             self._end_when_complete(now_s)

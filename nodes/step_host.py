@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from nodes.bus import Received
+from nodes.shell import IDLE_PERIOD_S
 from pipeline.mission import Mission
 from pipeline.steps import StepSpec
 from schemas import Envelope, Stamp
@@ -14,6 +15,8 @@ QUIET_NS = 200_000_000
 """A live step that can tell the time is told so when nothing came for this long, and then every
 ``TICK_NS``."""
 TICK_NS = 100_000_000
+IDLE_SHARE = 0.25
+"""Of the period of a mission's output rate: how late a propagated state may be."""
 
 
 class StepWork:
@@ -27,6 +30,11 @@ class StepWork:
         self._mission = mission
         self._step = spec.build(mission)
         self._tick = None if lossless else getattr(self._step, "tick", None)
+        period_s = getattr(self._step, "tick_period_s", None)
+        self._quiet_ns, self._tick_ns = QUIET_NS, TICK_NS
+        if period_s is not None:
+            self._quiet_ns = self._tick_ns = round(period_s * 1e9)
+            self.idle_period_s = min(period_s * IDLE_SHARE, IDLE_PERIOD_S)
         self._sequence: int | None = None
         self._t_last_ns = 0
 
@@ -45,9 +53,9 @@ class StepWork:
 
     def idle(self, t_ns: int) -> Iterable[Envelope]:
         """Tell a live step the time when its input has dried up."""
-        if self._tick is None or self._sequence is None or t_ns - self._t_last_ns < QUIET_NS:
+        if self._tick is None or self._sequence is None or t_ns - self._t_last_ns < self._quiet_ns:
             return []
-        self._t_last_ns = t_ns - QUIET_NS + TICK_NS
+        self._t_last_ns = t_ns - self._quiet_ns + self._tick_ns
         return self._wrap(self._tick(t_ns), Stamp(self._sequence, t_ns, t_ns))
 
     def close(self) -> None:

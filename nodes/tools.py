@@ -1,4 +1,4 @@
-"""The commands that need no bus: ``relnav detect``, ``marker``, ``dictionary``, ``score``, ``recover``, ``export``."""
+"""The commands that need no bus: detect, marker, dictionary, score, smooth, recover, export."""
 
 from __future__ import annotations
 
@@ -71,6 +71,14 @@ def dictionary(args: argparse.Namespace) -> None:
     args.out.parent.mkdir(parents=True, exist_ok=True)
     path = write_dictionary(chosen, args.out)
     print(f"{path}: {len(chosen)} identities of {args.family}, {chosen.minimum_distance} cells apart")
+
+
+def smooth(args: argparse.Namespace) -> None:
+    """Write a recorded run again, with every state told by all frames, those after it too."""
+    from pipeline.smoother import write_smoothed
+
+    out = args.out or args.recording.with_suffix(".smoothed.mcap")
+    print(f"{out}: {write_smoothed(args.recording, out)} states smoothed; `relnav score {out}` judges them")
 
 
 def score(args: argparse.Namespace) -> None:

@@ -1,30 +1,35 @@
 """One hypothesis of the pose filter: an iterated error-state Kalman filter on the corners of black squares.
 
-The algebra of prediction and of the Joseph update is filterpy's, with the nominal motion kept outside: its state is
-the error, zero before each update, and what it is given to measure is the corner residual.  Pixels: (0, 0) is the
-centre of the top-left pixel; corners in the marker's order.
+The nominal motion is kept outside; what calibration leaves open is considered, not estimated (Schmidt, 1966), and the
+covariance update is Joseph's, which holds for any gain.  Pixels: (0, 0) is the centre of the top-left pixel; corners
+in the marker's order.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dpotrf, dpotrs, dtrtrs
 from scipy.stats import chi2
 
 from astratag.camera import Camera
 from pipeline.dynamics import (
     ATTITUDE,
+    CONSIDERED,
     EDGE_BIAS,
     MOTION,
     POSITION,
     RATE,
+    SCALE,
+    SHIFT,
     STATES,
     VELOCITY,
     Motion,
+    OwnMotion,
     process_noise,
     right_jacobian_so3,
 )
@@ -42,6 +47,8 @@ NEAREST_M = 1e-3
 MOST_ITERATIONS = 20
 CONVERGED_SIGMAS = 1e-2
 """An iteration that moves no state by more than this share of its own uncertainty is the last."""
+LINEAR_SHARE = 0.02
+"""Where curvature moves corners by less than this share of their noise, one iteration is enough."""
 START_RANGE_SHARE = 0.3
 START_ATTITUDE_RAD = 1.0
 """Uncertainty of the first guess of a pose before its corners are used: so wide that only they count."""
@@ -67,93 +74,152 @@ class Eye:
     camera: Camera
     T_cam_chaser: Array
 
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Return the width and height of the camera's images."""
+        return self.camera.width, self.camera.height
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class Update:
     """What a set of measurements said about a hypothesis."""
 
     nis: float
     dof: int
     log_likelihood: float
+    whitened: Array
+    """The innovation (dof,) in its own standard deviations: white when the filter is right."""
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What a motion and its covariance predict of layers, and how they were measured instead."""
+
+    motion: Motion
+    P: Array
+    layers: tuple[SeenLayer, ...]
+    residual_px: Array
+    """Measured minus predicted (8 L,)."""
+    H: Array
+    """Its slopes (8 L, 16) by the error state."""
+    PHt: Array
+    R: Array
+    """Covariance (8 L, 8 L) of the measurement."""
+    S: Array
+    """Covariance (8 L, 8 L) of the residual."""
+
+    def only(self, chosen: Sequence[int]) -> Look:
+        """Return the part of some of the layers."""
+        rows = np.concatenate([np.arange(CORNER_DOF * k, CORNER_DOF * (k + 1)) for k in chosen])
+        layers = tuple(self.layers[k] for k in chosen)
+        R, S = (whole[np.ix_(rows, rows)] for whole in (self.R, self.S))
+        return Look(self.motion, self.P, layers, self.residual_px[rows], self.H[rows], self.PHt[:, rows], R, S)
 
 
 class CornerFilter:
-    """Motion of the target with its covariance (13, 13), order and axes as in ``pipeline.dynamics``."""
+    """Motion of the target with its covariance (16, 16), order and axes as in ``pipeline.dynamics``.
+
+    Nothing is changed in place: a motion and a covariance that were read stay what they were.
+    """
+
+    considered: slice = CONSIDERED
 
     def __init__(self, motion: Motion, P: Array, noise: FilterSection):
         self.motion = motion
         self.noise = noise
-        self._kalman = ExtendedKalmanFilter(dim_x=STATES, dim_z=CORNER_DOF)
-        self._kalman.x = np.zeros(STATES)
-        self._kalman.P = P
+        self._P = P
+        self._looked: Look | None = None
 
     @classmethod
-    def start(cls, T_chaser_target: Array, range_m: float, noise: FilterSection) -> CornerFilter:
+    def start(cls, T_chaser_target: Array, range_m: float, noise: FilterSection) -> Self:
         """Return a filter at a guessed pose, ``range_m`` from the camera, as good as ignorant of it."""
         sigma = np.empty(STATES)
         sigma[POSITION], sigma[ATTITUDE] = START_RANGE_SHARE * range_m, START_ATTITUDE_RAD
         sigma[VELOCITY], sigma[RATE] = noise.initial_speed_m_s, noise.initial_rate_rad_s
-        sigma[EDGE_BIAS] = noise.edge_bias_px
+        sigma[EDGE_BIAS], sigma[SCALE], sigma[SHIFT] = noise.edge_bias_px, noise.scale_sigma, noise.image_shift_px
         return cls(Motion.at_rest(T_chaser_target), np.diag(sigma**2), noise)
 
     @property
     def covariance(self) -> Array:
-        """Return the covariance (13, 13) of the error state."""
-        return self._kalman.P
+        """Return the covariance (16, 16) of the error state."""
+        return self._P
 
-    def copy(self) -> CornerFilter:
+    def copy(self) -> Self:
         """Return a filter of its own in the same state."""
-        return CornerFilter(self.motion, self.covariance.copy(), self.noise)
+        return type(self)(self.motion, self._P, self.noise)
 
-    def predict(self, dt_s: float, unseen_s: float = 0.0) -> None:
+    def predict(self, dt_s: float, unseen_s: float = 0.0, own: OwnMotion | None = None) -> None:
         """Let ``dt_s`` seconds pass, at the end of which nothing was measured for ``unseen_s`` seconds."""
-        self._kalman.F = self.motion.transition(dt_s, self.noise)
-        self._kalman.Q = process_noise(dt_s, self.noise, unseen_s)
-        self._kalman.predict()
-        self.motion = self.motion.after(dt_s, self.noise)
+        F = self.motion.transition(dt_s, self.noise, own)
+        self._P = F @ self._P @ F.T + process_noise(dt_s, self.noise, unseen_s)
+        self.motion = self.motion.after(dt_s, self.noise, own)
 
     def gate(self, layers: Sequence[SeenLayer], eye: Eye) -> Array:
         """Return the normalised innovation squared of each layer by itself, infinite where it cannot be seen."""
-        seen = predicted_corners(self.motion, layers, eye)
-        if seen is None and len(layers) > 1:
+        look = self._look(layers, eye)
+        if look is None and len(layers) > 1:
             return np.concatenate([self.gate([layer], eye) for layer in layers])
-        if seen is None:
+        if look is None:
             return np.array([np.inf])
-        distances = np.empty(len(layers))
-        for k, layer in enumerate(layers):
-            rows = slice(CORNER_DOF * k, CORNER_DOF * (k + 1))
-            residual, H = layer.corners_px.ravel() - seen[0][rows], seen[1][rows]
-            S = H @ self.covariance @ H.T + self._corner_noise([layer])
-            distances[k] = residual @ np.linalg.solve(S, residual)
-        return distances
+        count = len(layers)
+        of_layer = np.arange(count)
+        S = look.S.reshape(count, CORNER_DOF, count, CORNER_DOF)[of_layer, :, of_layer]
+        residual = look.residual_px.reshape(count, CORNER_DOF, 1)
+        return np.sum(residual * np.linalg.solve(S, residual), axis=(1, 2))
 
     def update(self, layers: Sequence[SeenLayer], eye: Eye) -> Update | None:
         """Take measurements in; return what they said, or None, and nothing changed, when they make no sense.
 
         Source: B. M. Bell and F. W. Cathey, "The iterated Kalman filter update as a Gauss-Newton method", 1993.
         """
-        prior, P_prior = self.motion, self.covariance
-        observed = np.concatenate([layer.corners_px.ravel() for layer in layers])
-        R = self._corner_noise(layers)
-        no_prediction = np.zeros(len(observed))
-        kalman, error = self._kalman, np.zeros(STATES)
+        prior, error = self.motion, np.zeros(STATES)
+        look, focal_px = self._look(layers, eye), float(eye.camera.K[0, 0])
+        linear_px = LINEAR_SHARE * min(layer.sigma_px for layer in layers)
         for _ in range(MOST_ITERATIONS):
-            seen = predicted_corners(prior.moved(error), layers, eye)
-            if seen is None:
-                break
-            H = seen[1]
-            H[:, ATTITUDE] = H[:, ATTITUDE] @ right_jacobian_so3(error[ATTITUDE])
-            kalman.x, kalman.P = np.zeros(STATES), P_prior
-            try:
-                kalman.update(observed - seen[0] + H @ error, lambda _, H=H: H, lambda _: no_prediction, R=R)
-                np.linalg.cholesky(kalman.P[MOTION, MOTION])
-            except (ValueError, np.linalg.LinAlgError):  # infinite, or no longer positive definite
-                break
-            step, error = kalman.x - error, kalman.x
-            if np.all(step**2 <= CONVERGED_SIGMAS**2 * np.diag(kalman.P) + np.finfo(float).tiny):
-                return self._accept(prior.moved(error), error)
-        kalman.P = P_prior
+            if look is None:
+                return None
+            innovation = look.residual_px + look.H @ error
+            L, fault = dpotrf(look.S, lower=1)
+            if fault:
+                return None
+            K = dpotrs(L, look.PHt.T, lower=1)[0].T
+            K[self.considered] = 0.0
+            step, error = K @ innovation - error, K @ innovation
+            variance = np.diag(self._P) - np.sum(K * look.PHt, axis=1)
+            is_last = np.all(step**2 <= CONVERGED_SIGMAS**2 * np.abs(variance) + np.finfo(float).tiny)
+            if is_last or _curvature_px(look, step, focal_px) < linear_px:
+                return self._accept(prior.moved(error), error, look, K, innovation, L)
+            look = self._look_from(prior.moved(error), layers, eye, right_jacobian_so3(error[ATTITUDE]))
         return None
+
+    def _look(self, layers: Sequence[SeenLayer], eye: Eye) -> Look | None:
+        """Return what is predicted of the layers, from what the gate has found already if it has."""
+        last = self._looked
+        if last is not None and last.motion is self.motion and last.P is self._P:
+            places = {id(layer): k for k, layer in enumerate(last.layers)}
+            chosen = [places.get(id(layer)) for layer in layers]
+            if chosen == list(range(len(last.layers))):
+                return last
+            if None not in chosen:
+                return last.only([k for k in chosen if k is not None])
+        self._looked = self._look_from(self.motion, layers, eye)
+        return self._looked
+
+    def _look_from(
+        self, motion: Motion, layers: Sequence[SeenLayer], eye: Eye, turned: Array | None = None
+    ) -> Look | None:
+        """Return what a motion predicts; ``turned`` (3, 3) takes attitude errors of the prior to the motion's."""
+        seen = predicted_corners(motion, layers, eye)
+        if seen is None:
+            return None
+        observed, H = np.concatenate([layer.corners_px.ravel() for layer in layers]), seen[1]
+        if turned is not None:
+            H[:, ATTITUDE] = H[:, ATTITUDE] @ turned
+        PHt, R = self._P @ H.T, self._corner_noise(layers)
+        S = H @ PHt + R
+        if not np.isfinite(S).all():
+            return None
+        return Look(motion, self._P, tuple(layers), observed - seen[0], H, PHt, R, S)
 
     def _corner_noise(self, layers: Sequence[SeenLayer]) -> Array:
         """Return the covariance (8 L, 8 L) of corners: each one's own, and the shift of the picture that all share."""
@@ -162,27 +228,34 @@ class CornerFilter:
         R[1::2, 1::2] += self.noise.picture_shift_px**2
         return R
 
-    def _accept(self, motion: Motion, error: Array) -> Update:
+    def _accept(self, motion: Motion, error: Array, look: Look, K: Array, innovation: Array, L: Array) -> Update | None:
         """Put the error into the motion and express the covariance in the axes of the new attitude."""
-        kalman = self._kalman
-        G = np.eye(STATES)
-        G[ATTITUDE, ATTITUDE] = right_jacobian_so3(error[ATTITUDE])
-        P = G @ kalman.P @ G.T
-        kalman.P, self.motion = (P + P.T) / 2, motion
-        nis = float(kalman.y @ kalman.SI @ kalman.y)
-        return Update(nis, len(kalman.y), -0.5 * (nis + float(np.linalg.slogdet(kalman.S)[1])))
+        IKH = np.eye(STATES) - K @ look.H
+        P = IKH @ self._P @ IKH.T + K @ look.R @ K.T
+        G = right_jacobian_so3(error[ATTITUDE])
+        P[ATTITUDE] = G @ P[ATTITUDE]
+        P[:, ATTITUDE] = P[:, ATTITUDE] @ G.T
+        P = (P + P.T) / 2
+        if not np.isfinite(P).all() or dpotrf(P[MOTION, MOTION], lower=1)[1]:
+            return None
+        self._P, self.motion, self._looked = P, motion, None
+        whitened = dtrtrs(L, innovation, lower=1)[0]
+        nis = float(whitened @ whitened)
+        log_likelihood = -0.5 * nis - float(np.log(np.diag(L)).sum())
+        return Update(nis, len(whitened), log_likelihood, whitened)
 
-    def widen(self, other: CornerFilter, probability: float) -> None:
-        """Cover also the other filter's motion, which is the right one with a (small) probability."""
+    def merged(self, other: CornerFilter, probability: float) -> CornerFilter:
+        """Return the mean of both, of which the other is the right one with a probability, with its covariance."""
         apart = self.motion.error_of(other.motion)
-        own, others = self.covariance, other.covariance
-        self._kalman.P = (1 - probability) * own + probability * (others + np.outer(apart, apart))
+        spread = probability * (1 - probability) * np.outer(apart, apart)
+        P = (1 - probability) * self._P + probability * other._P + spread
+        return CornerFilter(self.motion.moved(probability * apart), P, self.noise)
 
     def distrust_pose(self, factor: float) -> None:
         """Multiply the standard deviations of position and attitude."""
         scale = np.ones(STATES)
         scale[POSITION] = scale[ATTITUDE] = factor
-        self._kalman.P = scale[:, None] * self.covariance * scale
+        self._P = scale[:, None] * self.covariance * scale
 
     def misfit(self, layers: Sequence[SeenLayer], eye: Eye) -> float:
         """Return the squared residuals of layers at the motion as it is now, in units of their variance."""
@@ -203,48 +276,63 @@ class CornerFilter:
 
 
 def predicted_corners(motion: Motion, layers: Sequence[SeenLayer], eye: Eye) -> tuple[Array, Array] | None:
-    """Return where the layers' corners are seen (8 L,) px and how that follows the error state (8 L, 13).
+    """Return where the layers' corners are seen (8 L,) px and how that follows the error state (8 L, 16).
 
     None when a corner is not before the camera or anything is out of bounds.
     """
     points_target = np.concatenate([layer.points_target for layer in layers])
     R_cam_chaser = eye.T_cam_chaser[:3, :3]
     R_cam_target = R_cam_chaser @ motion.R_chaser_target
-    points_cam = points_target @ R_cam_target.T + R_cam_chaser @ motion.p_chaser_target_m + eye.T_cam_chaser[:3, 3]
+    place = R_cam_chaser @ motion.p_chaser_target_m + eye.T_cam_chaser[:3, 3]
+    points_cam = points_target @ R_cam_target.T + place
     if not np.isfinite(points_cam).all() or points_cam[:, 2].min() < NEAREST_M:
         return None
-    pixels = eye.camera.project(points_cam)
-    by_point = eye.camera.projection_jacobian(points_cam)
-    outward = outward_shift(pixels.reshape(-1, 4, 2)).reshape(-1, 2)
+    centre = eye.camera.K[:2, 2]
+    off_centre = eye.camera.project(points_cam) - centre
+    by_point = (1 + motion.scale) * eye.camera.projection_jacobian(points_cam)
+    outward = outward_shift(off_centre.reshape(-1, 4, 2)).reshape(-1, 2)
 
-    H = np.zeros((len(pixels), 2, STATES))
+    H = np.zeros((len(off_centre), 2, STATES))
     H[:, :, POSITION] = by_point @ R_cam_chaser
     H[:, :, ATTITUDE] = cross_rows(points_target, by_point @ R_cam_target)
     H[:, :, EDGE_BIAS] = outward
-    pixels = pixels + motion.edge_bias_px * outward
+    H[:, :, SCALE] = off_centre
+    H[:, 0, SHIFT.start] = H[:, 1, SHIFT.start + 1] = 1.0
+    pixels = centre + (1 + motion.scale) * off_centre + motion.shift_px + motion.edge_bias_px * outward
     if not (np.isfinite(pixels).all() and np.isfinite(H).all()):
         return None
     return pixels.ravel(), H.reshape(-1, STATES)
 
 
+def _curvature_px(look: Look, step: Array, focal_px: float) -> float:
+    """Return about how much farther than linearly a step moves corners: by squares of the angle and of the way."""
+    way_px = float(np.abs(look.H[:, POSITION]).max() * np.linalg.norm(step[POSITION]))
+    size_px = float(np.abs(look.H[:, ATTITUDE]).max())
+    return way_px**2 / focal_px + size_px * float(step[ATTITUDE] @ step[ATTITUDE])
+
+
 def cross_rows(points: Array, rows: Array) -> Array:
     """Return points (N, 3) crossed with each row of matrices (N, 2, 3): a.(w x r) = (r x a).w."""
-    x, y, z = (points[:, k, None] for k in range(3))
+    x, y, z = points.T[:, :, None]
     a, b, c = rows[..., 0], rows[..., 1], rows[..., 2]
-    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=-1)
+    crossed = np.empty(rows.shape)
+    crossed[..., 0], crossed[..., 1], crossed[..., 2] = y * c - z * b, z * a - x * c, x * b - y * a
+    return crossed
 
 
 def outward_shift(quads_px: Array) -> Array:
     """Return how corners (L, 4, 2) move when every edge of their quad moves outward by a pixel.
 
-    A corner moves by d with d.n = 1 for the outward normals n of both its edges.
+    A corner moves by d with d.n = 1 for the outward normals n of both its edges.  In complex numbers x + i y, in which
+    the conjugate of one times another is dot product + i cross product.
     """
-    edges = quads_px[:, NEXT_CORNER] - quads_px
-    x, y = edges[..., 0], edges[..., 1]
-    turn = np.sign(np.sum(x * y[:, NEXT_CORNER] - y * x[:, NEXT_CORNER], axis=1))
-    normals = np.stack([y, -x], axis=-1) * (turn[:, None] / np.maximum(np.hypot(x, y), np.finfo(float).tiny))[..., None]
+    corners = quads_px[..., 0] + 1j * quads_px[..., 1]
+    edges = corners[:, NEXT_CORNER] - corners
+    turn = np.sign(np.sum((edges.conj() * edges[:, NEXT_CORNER]).imag, axis=1, keepdims=True))
+    normals = -1j * turn * edges / np.maximum(np.abs(edges), np.finfo(float).tiny)
     before = normals[:, PREVIOUS_CORNER]
-    return (before + normals) / np.maximum(1 + np.sum(before * normals, axis=2, keepdims=True), SHARPEST)
+    shift = (before + normals) / np.maximum(1 + (before.conj() * normals).real, SHARPEST)
+    return np.stack([shift.real, shift.imag], axis=-1)
 
 
 def gate_limit(probability: float, dof: int) -> float:

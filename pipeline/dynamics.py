@@ -1,40 +1,62 @@
 """How the target moves past the chaser between two pictures, and how an error in that motion grows.
 
 The nominal motion lives outside the filter; the error state is, in this order, position (m, chaser axes), attitude
-(rad, right perturbation in target axes), velocity (m/s, chaser axes), rate (rad/s, target axes), and the bias of the
-marker's edges (px, outward).  Drift is at constant velocity and constant rate, driven by white accelerations.
+(rad, right perturbation in target axes), velocity (m/s, chaser axes), rate (rad/s, target axes), the bias of the
+marker's edges (px, outward), and what is only considered: the share by which the focal length is off, and the constant
+shift of all pictures (px).  Drift is as the mission says, driven by white accelerations.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.transforms import exp_so3, log_so3, pose, skew
-from pipeline.mission import FilterSection
+from astratag.transforms import exp_so3, log_so3, pose, rotation_from_wxyz, skew
+from pipeline.hill import clohessy_wiltshire
+from pipeline.mission import DriftSection, FilterSection
 
 Array = NDArray[np.float64]
 
 POSITION, ATTITUDE, VELOCITY, RATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 MOTION = slice(0, 12)
-EDGE_BIAS = 12
-STATES = 13
+EDGE_BIAS, SCALE, SHIFT = 12, 13, slice(14, 16)
+CONSIDERED = slice(13, 16)
+"""States that are never estimated, only reckoned with: constants of the calibration (Schmidt, 1966)."""
+STATES = 16
+PLACES, SPEEDS = np.r_[POSITION, ATTITUDE], np.r_[VELOCITY, RATE]
 
 SMALL_ANGLE_RAD = 1e-4
 """Below it, the series of the right Jacobian to second order is exact to 1e-13."""
 
 
 @dataclass(frozen=True, eq=False)
+class OwnMotion:
+    """What the chaser knows of its own motion; it holds until it tells anew."""
+
+    R_hill_chaser: Array
+    omega_hill_chaser_in_chaser_rad_s: Array
+    acceleration_chaser_m_s2: Array
+    """By its thrusters, chaser axes."""
+
+    @classmethod
+    def of(cls, drift: DriftSection) -> OwnMotion:
+        """Return that of a chaser which keeps its attitude in the Hill frame and does not thrust."""
+        return cls(rotation_from_wxyz(drift.R_hill_chaser_wxyz), np.zeros(3), np.zeros(3))
+
+
+@dataclass(frozen=True, eq=False)
 class Motion:
-    """The nominal relative motion, and the bias of the marker's edges beside it."""
+    """The nominal relative motion, and beside it what shifts the corners: edge bias, focal share, picture shift."""
 
     p_chaser_target_m: Array
     R_chaser_target: Array
     v_chaser_target_m_s: Array
     omega_chaser_target_in_target_rad_s: Array
     edge_bias_px: float = 0.0
+    scale: float = 0.0
+    shift_px: Array = field(default_factory=lambda: np.zeros(2))
 
     @classmethod
     def at_rest(cls, T_chaser_target: Array) -> Motion:
@@ -46,62 +68,150 @@ class Motion:
         return pose(self.R_chaser_target, self.p_chaser_target_m)
 
     def moved(self, error: Array) -> Motion:
-        """Return this motion with an error state (13,) put in."""
+        """Return this motion with an error state (16,) put in."""
         return Motion(
             self.p_chaser_target_m + error[POSITION],
             self.R_chaser_target @ exp_so3(error[ATTITUDE]),
             self.v_chaser_target_m_s + error[VELOCITY],
             self.omega_chaser_target_in_target_rad_s + error[RATE],
             self.edge_bias_px + float(error[EDGE_BIAS]),
+            self.scale + float(error[SCALE]),
+            self.shift_px + error[SHIFT],
         )
 
     def error_of(self, other: Motion) -> Array:
-        """Return the error state (13,) with ``self.moved(error)`` equal to ``other``."""
+        """Return the error state (16,) with ``self.moved(error)`` equal to ``other``."""
         return np.concatenate(
             [
                 other.p_chaser_target_m - self.p_chaser_target_m,
                 log_so3(self.R_chaser_target.T @ other.R_chaser_target),
                 other.v_chaser_target_m_s - self.v_chaser_target_m_s,
                 other.omega_chaser_target_in_target_rad_s - self.omega_chaser_target_in_target_rad_s,
-                [other.edge_bias_px - self.edge_bias_px],
+                [other.edge_bias_px - self.edge_bias_px, other.scale - self.scale],
+                other.shift_px - self.shift_px,
             ]
         )
 
-    def after(self, dt_s: float, noise: FilterSection) -> Motion:
+    def after(self, dt_s: float, noise: FilterSection, own: OwnMotion | None = None) -> Motion:
         """Return the motion ``dt_s`` seconds later."""
-        return replace(
-            self,
-            p_chaser_target_m=self.p_chaser_target_m + self.v_chaser_target_m_s * dt_s,
-            R_chaser_target=self.R_chaser_target @ exp_so3(self.omega_chaser_target_in_target_rad_s * dt_s),
-            edge_bias_px=self.edge_bias_px * float(np.exp(-dt_s / noise.edge_bias_correlation_s)),
-        )
+        p, v, omega = self.p_chaser_target_m, self.v_chaser_target_m_s, self.omega_chaser_target_in_target_rad_s
+        if own is None and noise.drift.translation == "constant_velocity":
+            p = p + v * dt_s
+        else:
+            A, b = translation_drift(dt_s, noise.drift, own)
+            moved = A @ np.concatenate([p, v]) + b
+            p, v = moved[:3], moved[3:]
+        if noise.drift.attitude == "constant_rate":
+            R = self.R_chaser_target @ exp_so3(omega * dt_s)
+        else:
+            R, omega = free_rotation(self.R_chaser_target, omega, dt_s, noise.drift, own)
+        edge_bias_px = self.edge_bias_px * float(np.exp(-dt_s / noise.edge_bias_correlation_s))
+        return Motion(p, R, v, omega, edge_bias_px, self.scale, self.shift_px)
 
-    def transition(self, dt_s: float, noise: FilterSection) -> Array:
-        """Return how an error state now becomes one ``dt_s`` later, (13, 13)."""
+    def transition(self, dt_s: float, noise: FilterSection, own: OwnMotion | None = None) -> Array:
+        """Return how an error state now becomes one ``dt_s`` later, (16, 16)."""
         turn_rad = self.omega_chaser_target_in_target_rad_s * dt_s
         F = np.eye(STATES)
-        F[POSITION, VELOCITY] = dt_s * np.eye(3)
+        if own is None and noise.drift.translation == "constant_velocity":
+            F[PLACES[:3], SPEEDS[:3]] = dt_s
+        else:
+            A, _ = translation_drift(dt_s, noise.drift, own)
+            F[POSITION, POSITION], F[POSITION, VELOCITY] = A[:3, :3], A[:3, 3:]
+            F[VELOCITY, POSITION], F[VELOCITY, VELOCITY] = A[3:, :3], A[3:, 3:]
         F[ATTITUDE, ATTITUDE] = exp_so3(-turn_rad)
         F[ATTITUDE, RATE] = dt_s * right_jacobian_so3(turn_rad)
+        if noise.drift.attitude == "rigid_body":
+            _free_rotation_slopes(F, self, dt_s, noise.drift, own)
         F[EDGE_BIAS, EDGE_BIAS] = np.exp(-dt_s / noise.edge_bias_correlation_s)
         return F
 
+    def observed_from(self, before: OwnMotion, now: OwnMotion) -> Motion:
+        """Return the same motion as a chaser sees it whose own rate has just changed."""
+        jump = now.omega_hill_chaser_in_chaser_rad_s - before.omega_hill_chaser_in_chaser_rad_s
+        return replace(
+            self,
+            v_chaser_target_m_s=self.v_chaser_target_m_s - np.cross(jump, self.p_chaser_target_m),
+            omega_chaser_target_in_target_rad_s=self.omega_chaser_target_in_target_rad_s
+            - self.R_chaser_target.T @ jump,
+        )
+
+
+def translation_drift(dt_s: float, drift: DriftSection, own: OwnMotion | None) -> tuple[Array, Array]:
+    """Return A (6, 6) and b (6,) that take position and velocity, chaser axes, to those ``dt_s`` later.
+
+    Through the Hill frame, where the chaser is at -R p and moves at -R (v + omega x p): by the equations of Clohessy
+    and Wiltshire, or straight on, and by its own thrust.
+    """
+    own = OwnMotion.of(drift) if own is None else own
+    rate_rad_s = drift.orbit_rate_rad_s if drift.translation == "clohessy_wiltshire" else 0.0
+    Phi, Gamma = clohessy_wiltshire(rate_rad_s, dt_s)
+    R0, W, zero = own.R_hill_chaser, skew(own.omega_hill_chaser_in_chaser_rad_s), np.zeros((3, 3))
+    R1 = R0 @ exp_so3(own.omega_hill_chaser_in_chaser_rad_s * dt_s)
+    to_hill = -np.block([[R0, zero], [R0 @ W, R0]])
+    from_hill = np.block([[-R1.T, zero], [W @ R1.T, -R1.T]])
+    return from_hill @ Phi @ to_hill, from_hill @ (Gamma @ (R0 @ own.acceleration_chaser_m_s2))
+
+
+def free_rotation(
+    R_chaser_target: Array, omega: Array, dt_s: float, drift: DriftSection, own: OwnMotion | None
+) -> tuple[Array, Array]:
+    """Return attitude and rate ``dt_s`` later of a rigid target that turns freely, by a midpoint step.
+
+    Euler's equations hold for the rate in space, of which the chaser's own is part.
+    """
+    own_rate = _inertial_rate(drift, own)
+    J = np.array(drift.target_inertia)
+    inertial = omega + R_chaser_target.T @ own_rate
+    middle = inertial + dt_s / 2 * _euler(inertial, J)
+    later = inertial + dt_s * _euler(middle, J)
+    half_turned = R_chaser_target @ exp_so3(omega * dt_s / 2)
+    R = R_chaser_target @ exp_so3((middle - half_turned.T @ own_rate) * dt_s)
+    return R, later - R.T @ own_rate
+
+
+def _euler(omega: Array, inertia: Array) -> Array:
+    return -np.cross(omega, inertia * omega) / inertia
+
+
+def _euler_slopes(omega: Array, inertia: Array) -> Array:
+    return (skew(inertia * omega) - skew(omega) * inertia) / inertia[:, None]
+
+
+def _inertial_rate(drift: DriftSection, own: OwnMotion | None) -> Array:
+    """Return the chaser's rate in space (3,), chaser axes: its own, and its orbit's about z of the Hill frame."""
+    own = OwnMotion.of(drift) if own is None else own
+    return own.omega_hill_chaser_in_chaser_rad_s + own.R_hill_chaser.T @ np.array([0.0, 0.0, drift.orbit_rate_rad_s])
+
+
+def _free_rotation_slopes(F: Array, motion: Motion, dt_s: float, drift: DriftSection, own: OwnMotion | None) -> None:
+    """Put into a transition how attitude and rate follow each other to first order in ``dt_s``."""
+    R, omega = motion.R_chaser_target, motion.omega_chaser_target_in_target_rad_s
+    J, own_rate = np.array(drift.target_inertia), _inertial_rate(drift, own)
+    inertial = omega + R.T @ own_rate
+    middle = inertial + dt_s / 2 * _euler(inertial, J)
+    R_later, _ = free_rotation(R, omega, dt_s, drift, own)
+    half = np.eye(3) + dt_s / 2 * _euler_slopes(inertial, J)
+    spin = np.eye(3) + dt_s * _euler_slopes(middle, J) @ half
+    turn_rad = (middle - exp_so3(-omega * dt_s / 2) @ R.T @ own_rate) * dt_s
+    F[ATTITUDE, ATTITUDE] = exp_so3(-turn_rad)
+    F[ATTITUDE, RATE] = dt_s * right_jacobian_so3(turn_rad) @ half
+    own_before, own_later = skew(R.T @ own_rate), skew(R_later.T @ own_rate)
+    F[RATE, ATTITUDE] = spin @ own_before - own_later @ F[ATTITUDE, ATTITUDE]
+    F[RATE, RATE] = spin - own_later @ F[ATTITUDE, RATE]
+
 
 def process_noise(dt_s: float, noise: FilterSection, unseen_s: float = 0.0) -> Array:
-    """Return the covariance (13, 13) that ``dt_s`` seconds of white accelerations and of edge bias drift add.
+    """Return the covariance (16, 16) that ``dt_s`` seconds of white accelerations and of edge bias drift add.
 
     Measured often, accelerations are white over ``correlation_s``.  An acceleration that has not been seen for longer,
     ``unseen_s`` seconds, has acted all the while: speeds then grow uncertain with time, not with its square root.
     """
+    sigmas = (noise.acceleration_m_s2, noise.angular_acceleration_rad_s2)
+    density = np.repeat(np.square(sigmas), 3) * max(noise.correlation_s, unseen_s)
     Q = np.zeros((STATES, STATES))
-    for place, speed, sigma in (
-        (POSITION, VELOCITY, noise.acceleration_m_s2),
-        (ATTITUDE, RATE, noise.angular_acceleration_rad_s2),
-    ):
-        density = sigma**2 * max(noise.correlation_s, unseen_s)
-        Q[place, place] = density * dt_s**3 / 3 * np.eye(3)
-        Q[place, speed] = Q[speed, place] = density * dt_s**2 / 2 * np.eye(3)
-        Q[speed, speed] = density * dt_s * np.eye(3)
+    Q[PLACES, PLACES] = density * (dt_s**3 / 3)
+    Q[PLACES, SPEEDS] = Q[SPEEDS, PLACES] = density * (dt_s**2 / 2)
+    Q[SPEEDS, SPEEDS] = density * dt_s
     Q[EDGE_BIAS, EDGE_BIAS] = -(noise.edge_bias_px**2) * np.expm1(-2 * dt_s / noise.edge_bias_correlation_s)
     return Q
 

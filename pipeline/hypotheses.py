@@ -1,28 +1,40 @@
 """The poses that explain what is seen: one, or two while a planar marker leaves it open which way it is tilted.
 
 Each pose is a filter of its own; measurements move their probabilities until one is so much likelier that the other
-is dropped, or until the two have become one.
+is dropped, or until the two have come to the same.  Two that are near, for their uncertainty or at all, are published
+as one that covers both.  Which way a print is tilted is left to the evidence of the last looks, never to where it
+began: a pose counts as the only one while its mirror image fits them so much worse, and is ambiguous otherwise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.transforms import inverse
+from astratag.transforms import inverse, skew
 from pipeline.corner_filter import CORNER_DOF, CornerFilter, Eye, SeenLayer, Update
-from pipeline.dynamics import ATTITUDE
+from pipeline.dynamics import ATTITUDE, POSITION, RATE, STATES, VELOCITY, OwnMotion
 from pipeline.mission import FilterSection
 
 Array = NDArray[np.float64]
 
 POSE_DOF = 6
+LOOKS = 100
+"""How many of the last looks at the corners tell a pose from its mirror image."""
+FEWEST_LOOKS = 8.0
+SETTLED = 4.0
+"""Evidence so many times what is asked for is looked at again only now and then."""
+RECHECK = 5
 START_MISFIT = 25.0
 """A first pose whose squared residuals are this many times what their noise explains is not believed."""
 FIRST_LOOK = 4.0
 """How many times less certain a pose is begun with than its corners promise: a search is cruder than tracking."""
+SAME_POSE = 0.02
+"""Squared distance, as below, from which on two filters have come to the same and one is enough."""
 ONE_MODE = 2.0
 """Squared distance, in units of the summed covariances, below which two equal Gaussians have a single mode: each is
 then within two of its own standard deviations of the other."""
@@ -31,15 +43,37 @@ then within two of its own standard deviations of the other."""
 class HypothesisBank:
     """One or two filters with their logarithmic weights, the likeliest first."""
 
-    def __init__(self, filters: list[CornerFilter], log_weights: list[float], noise: FilterSection):
+    def __init__(
+        self,
+        filters: list[CornerFilter],
+        log_weights: list[float],
+        noise: FilterSection,
+        T_target_marker: Array,
+        eye: Eye,
+    ):
+        """``T_target_marker`` is where the print lies that could be tilted the other way."""
         self.filters, self._log_weights, self._noise = filters, log_weights, noise
+        self._T_target_marker, self._eye = T_target_marker, eye
+        self._is_one_mode = False
+        self._against, self._looks = 0.0, 0.0
+        """Half of how much worse the likeliest pose's mirror image fits than itself, summed over the last looks."""
+        self._evidence = 0.0
+        """The same as a logarithmic likelihood ratio."""
+        self._enough = float(np.log(noise.ambiguity_ratio))
+        self._unchecked = 0
         self._sort_and_prune()
 
     @classmethod
     def start(
-        cls, guesses: Sequence[Array], layers: Sequence[SeenLayer], eye: Eye, noise: FilterSection
+        cls,
+        guesses: Sequence[Array],
+        layers: Sequence[SeenLayer],
+        eye: Eye,
+        noise: FilterSection,
+        T_target_marker: Array | None = None,
     ) -> HypothesisBank | None:
         """Return the poses that guesses T_chaser_target (4, 4) lead to on the corners; None when none fits them."""
+        T_target_marker = np.eye(4) if T_target_marker is None else T_target_marker
         found: list[tuple[float, CornerFilter]] = []
         for guess in guesses:
             seen_from = eye.T_cam_chaser @ guess
@@ -52,12 +86,16 @@ class HypothesisBank:
             return None
         best_misfit, best = found[0]
         scale = max(1.0, best_misfit / dof)
-        rival = next((pair for pair in found[1:] if not is_one_mode(best, pair[1])), None)
-        for candidate in (best,) if rival is None else (best, rival[1]):
-            candidate.distrust_pose(FIRST_LOOK)
+        rival = next((pair for pair in found[1:] if distance(best, pair[1]) > SAME_POSE), None)
         if rival is None:
-            return cls([best], [0.0], noise)
-        return cls([best, rival[1]], [-best_misfit / scale / 2, -rival[0] / scale / 2], noise)
+            bank = cls([best], [0.0], noise, T_target_marker, eye)
+        else:
+            weights = [-best_misfit / scale / 2, -rival[0] / scale / 2]
+            bank = cls([best, rival[1]], weights, noise, T_target_marker, eye)
+        bank._weigh_mirrored(bank._worse_mirrored(layers, eye) / scale, layers, eye)
+        for candidate in bank.filters:
+            candidate.distrust_pose(FIRST_LOOK)
+        return bank
 
     @property
     def best(self) -> CornerFilter:
@@ -65,24 +103,48 @@ class HypothesisBank:
         return self.filters[0]
 
     @property
+    def estimate(self) -> CornerFilter:
+        """Return what to publish: the likeliest pose, or the mean of two that are near, covering both."""
+        if self.is_ambiguous or self._is_sure:
+            return self.best
+        rival = self.filters[1] if len(self.filters) > 1 else mirrored(self.best, self._T_target_marker, self._eye)
+        return self.best.merged(rival, 1.0 - self.probability)
+
+    @property
     def is_ambiguous(self) -> bool:
-        """Tell whether two poses are still possible."""
-        return len(self.filters) > 1
+        """Tell whether two poses are still possible that are not one, for their uncertainty or at all.
+
+        After a few looks at a distant print both may still be far from where they are going.
+        """
+        return not (self._is_sure or (self._is_one_mode and self._looks > FEWEST_LOOKS))
+
+    @property
+    def _is_sure(self) -> bool:
+        return len(self.filters) == 1 and self._evidence >= self._enough
 
     @property
     def probability(self) -> float:
         """Return that of the likeliest pose."""
+        if len(self.filters) == 1:
+            return float(1.0 / (1.0 + np.exp(-max(self._evidence, 0.0))))
         weights = np.exp(np.array(self._log_weights) - self._log_weights[0])
         return float(1.0 / weights.sum())
 
     def copy(self) -> HypothesisBank:
         """Return a bank of its own in the same state."""
-        return HypothesisBank([f.copy() for f in self.filters], list(self._log_weights), self._noise)
+        bank = copy(self)
+        bank.filters, bank._log_weights = [f.copy() for f in self.filters], list(self._log_weights)
+        return bank
 
-    def predict(self, dt_s: float, unseen_s: float = 0.0) -> None:
+    def predict(self, dt_s: float, unseen_s: float = 0.0, own: OwnMotion | None = None) -> None:
         """Let ``dt_s`` seconds pass, at the end of which nothing was measured for ``unseen_s`` seconds."""
         for hypothesis in self.filters:
-            hypothesis.predict(dt_s, unseen_s)
+            hypothesis.predict(dt_s, unseen_s, own)
+
+    def observe_from(self, before: OwnMotion, now: OwnMotion) -> None:
+        """Have the chaser's own rate change, which is known."""
+        for hypothesis in self.filters:
+            hypothesis.motion = hypothesis.motion.observed_from(before, now)
 
     def gate(self, layers: Sequence[SeenLayer], eye: Eye) -> Array:
         """Return the normalised innovation squared of each layer under the pose that it fits best."""
@@ -94,6 +156,9 @@ class HypothesisBank:
         Where even the better pose fits worse than the corner noise explains, likelihoods count in units of its own
         misfit, so that an underestimated noise cannot decide between the poses.
         """
+        is_due = self._evidence < SETTLED * self._enough or self._unchecked >= RECHECK
+        self._unchecked = 0 if is_due else self._unchecked + 1
+        worse = self._worse_mirrored(layers, eye) if is_due else None
         kept = [
             (update, hypothesis, weight)
             for hypothesis, weight in zip(self.filters, self._log_weights, strict=True)
@@ -104,26 +169,68 @@ class HypothesisBank:
         scale = max(1.0, min(update.nis / update.dof for update, _, _ in kept))
         self.filters = [hypothesis for _, hypothesis, _ in kept]
         self._log_weights = [weight + update.log_likelihood / scale for update, _, weight in kept]
-        updates = {id(hypothesis): update for update, hypothesis, _ in kept}
+        likeliest = kept[int(np.argmax(self._log_weights))][0]
         self._sort_and_prune()
-        return updates[id(self.best)]
+        if worse is not None:
+            self._weigh_mirrored(worse / scale, layers, eye)
+        return likeliest
+
+    def _worse_mirrored(self, layers: Sequence[SeenLayer], eye: Eye) -> float:
+        """Return how much larger the squared residuals are under the mirror image of the likeliest pose."""
+        image = mirrored(self.best, self._T_target_marker, eye)
+        return image.misfit(layers, eye) - self.best.misfit(layers, eye)
+
+    def _weigh_mirrored(self, worse: float, layers: Sequence[SeenLayer], eye: Eye) -> None:
+        """Take in what a look says against the mirror image, and follow that too where it fits better.
+
+        Corners that are off for long by ``corner_bias_px`` repeat themselves: many looks then count like few.
+        """
+        fade = 1 - 1 / LOOKS
+        self._against, self._looks = fade * self._against + worse / 2, fade * self._looks + 1
+        sigma_px = min(layer.sigma_px for layer in layers)
+        self._evidence = self._against / (1 + self._looks * (self._noise.corner_bias_px / sigma_px) ** 2)
+        if len(self.filters) > 1:
+            return
+        image = mirrored(self.best, self._T_target_marker, eye)
+        self._is_one_mode = is_one_mode(self.best, image, self._noise)
+        if self._evidence > 0 or self._is_one_mode:
+            return
+        image.distrust_pose(FIRST_LOOK)
+        if image.update(layers, eye) is not None:
+            self.filters.append(image)
+            self._log_weights.append(0.0)
+            self._sort_and_prune()
 
     def _sort_and_prune(self) -> None:
         order = np.argsort([-weight for weight in self._log_weights], kind="stable")
+        if order[0] != 0:
+            self._against, self._evidence = -self._against, -self._evidence
         self.filters = [self.filters[k] for k in order]
         self._log_weights = [self._log_weights[k] - self._log_weights[order[0]] for k in order]
-        unlikely = self._log_weights[-1] < -np.log(self._noise.ambiguity_ratio)
-        if self.is_ambiguous and (unlikely or is_one_mode(*self.filters)):
-            if not unlikely:
-                self.best.widen(self.filters[1], 1.0 - self.probability)
+        if len(self.filters) == 1:
+            return
+        apart = distance(*self.filters)
+        self._is_one_mode = is_one_mode(self.filters[0], self.filters[1], self._noise)
+        if apart < SAME_POSE:
+            self.filters[0] = self.estimate
+        if apart < SAME_POSE or self._log_weights[-1] < -np.log(self._noise.ambiguity_ratio):
             del self.filters[1:], self._log_weights[1:]
 
 
-def is_one_mode(a: CornerFilter, b: CornerFilter) -> bool:
-    """Tell whether two filters' attitudes are so near, for their uncertainty, that they are one pose."""
+def distance(a: CornerFilter, b: CornerFilter) -> float:
+    """Return the squared distance between two filters' attitudes, in units of their summed covariances."""
     apart = a.motion.error_of(b.motion)[ATTITUDE]
     spread = a.covariance[ATTITUDE, ATTITUDE] + b.covariance[ATTITUDE, ATTITUDE]
-    return float(apart @ np.linalg.solve(spread, apart)) < ONE_MODE
+    return float(apart @ np.linalg.solve(spread, apart))
+
+
+def is_one_mode(a: CornerFilter, b: CornerFilter, noise: FilterSection) -> bool:
+    """Tell whether two filters' attitudes are so near that a covariance about their mean may stand for both."""
+    apart_rad = float(np.linalg.norm(a.motion.error_of(b.motion)[ATTITUDE]))
+    return apart_rad < noise.one_tilt_rad or distance(a, b) < ONE_MODE
+
+
+MIRROR = np.diag([1.0, 1.0, -1.0])
 
 
 def mirrored_pose(T_cam_marker: Array) -> Array:
@@ -133,8 +240,36 @@ def mirrored_pose(T_cam_marker: Array) -> Array:
     """
     T = T_cam_marker.copy()
     sight = T[:3, 3] / np.linalg.norm(T[:3, 3])
-    T[:3, :3] = (np.eye(3) - 2 * np.outer(sight, sight)) @ T[:3, :3] @ np.diag([1.0, 1.0, -1.0])
+    T[:3, :3] = (np.eye(3) - 2 * np.outer(sight, sight)) @ T[:3, :3] @ MIRROR
     return T
+
+
+def mirrored(one: CornerFilter, T_target_marker: Array, eye: Eye) -> CornerFilter:
+    """Return a filter's mirror image: where the print lies, and how it moves, stay; tilt and tumble are reversed."""
+    motion, place_target = one.motion, T_target_marker[:3, 3]
+    R_target_marker = T_target_marker[:3, :3]
+    T_cam_marker = eye.T_cam_chaser @ motion.pose_chaser_target() @ T_target_marker
+    R = eye.T_cam_chaser[:3, :3].T @ mirrored_pose(T_cam_marker)[:3, :3] @ R_target_marker.T
+    reversed_ = -R_target_marker @ MIRROR @ R_target_marker.T  # M R Exp(d) D = (M R D) Exp(-D d)
+    omega = reversed_ @ motion.omega_chaser_target_in_target_rad_s
+    by_lever = R @ skew(place_target) @ reversed_ - motion.R_chaser_target @ skew(place_target)
+    J = np.eye(STATES)
+    J[ATTITUDE, ATTITUDE] = J[RATE, RATE] = reversed_
+    J[POSITION, ATTITUDE] = J[VELOCITY, RATE] = by_lever
+    p = motion.p_chaser_target_m + (motion.R_chaser_target - R) @ place_target
+    v = (
+        motion.v_chaser_target_m_s
+        + motion.R_chaser_target @ np.cross(motion.omega_chaser_target_in_target_rad_s, place_target)
+        - R @ np.cross(omega, place_target)
+    )
+    moved = replace(
+        motion,
+        p_chaser_target_m=p,
+        R_chaser_target=R,
+        v_chaser_target_m_s=v,
+        omega_chaser_target_in_target_rad_s=omega,
+    )
+    return CornerFilter(moved, J @ one.covariance @ J.T, one.noise)
 
 
 def guesses_in_chaser(poses_cam_marker: Sequence[Array], eye: Eye, T_marker_target: Array) -> list[Array]:

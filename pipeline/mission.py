@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -68,8 +69,16 @@ class PoseSection(Section):
         return self
 
     def matrix(self) -> NDArray[np.float64]:
-        """Return the 4x4 transform."""
-        return pose(rotation_from_wxyz(self.rotation_wxyz), self.translation_m)
+        """Return the 4x4 transform, which is shared and cannot be written to."""
+        return _matrix(self.translation_m, self.rotation_wxyz)
+
+
+@lru_cache(maxsize=1024)
+def _matrix(translation_m: tuple[float, ...], rotation_wxyz: tuple[float, ...]) -> NDArray[np.float64]:
+    """Return a transform; every frame asks for those of the mission."""
+    T = pose(rotation_from_wxyz(rotation_wxyz), translation_m)
+    T.setflags(write=False)
+    return T
 
 
 class FlatSection(Section):
@@ -150,8 +159,34 @@ class CorridorSection(Section):
         return self
 
 
+class DriftSection(Section):
+    """How the target moves past the chaser when nothing is known of accelerations."""
+
+    translation: Literal["constant_velocity", "clohessy_wiltshire"] = "constant_velocity"
+    orbit_rate_rad_s: float = Field(default=0.0, ge=0)
+    """Of a circular orbit, for Clohessy-Wiltshire."""
+    R_hill_chaser_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    """The chaser's attitude in the Hill frame of ``schemas``, which it keeps unless it tells otherwise."""
+    attitude: Literal["constant_rate", "rigid_body"] = "constant_rate"
+    target_inertia: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Principal moments about the target's axes, in any unit, for a rigid body that turns freely."""
+
+    @model_validator(mode="after")
+    def _means_something(self) -> DriftSection:
+        if self.translation == "clohessy_wiltshire" and self.orbit_rate_rad_s == 0:
+            raise ValueError("clohessy_wiltshire needs an orbit_rate_rad_s, such as 0.00113 in low Earth orbit")
+        if min(self.target_inertia) <= 0:
+            raise ValueError(f"target_inertia must be positive, got {list(self.target_inertia)}")
+        norm = float(np.linalg.norm(self.R_hill_chaser_wxyz))
+        if abs(norm - 1) > 1e-3:
+            raise ValueError(f"R_hill_chaser_wxyz must be a unit quaternion, its norm is {norm:.4g}")
+        return self
+
+
 class FilterSection(Section):
     """The pose filter's noise, gates and timers."""
+
+    drift: DriftSection = DriftSection()
 
     acceleration_m_s2: float = Field(default=0.005, gt=0)
     """Standard deviation of the relative acceleration, white over ``correlation_s``: slow approaches without burns."""
@@ -160,8 +195,14 @@ class FilterSection(Section):
     edge_bias_px: float = Field(default=0.03, ge=0)
     """How far the edges of every black square may be measured outside or inside their place, all by the same."""
     edge_bias_correlation_s: float = Field(default=5.0, gt=0)
-    corner_floor_px: float = Field(default=0.03, gt=0)
+    corner_bias_px: float = Field(default=0.02, ge=0)
+    """How far each corner may be off by itself for long: repeated looks then tell two poses apart no better."""
+    corner_floor_px: float = Field(default=0.02, gt=0)
     """No corner is believed better than this."""
+    scale_sigma: float = Field(default=2e-4, ge=0)
+    """How far the focal length, as a share of itself, may be off, or the marker's size: constant, considered."""
+    image_shift_px: float = Field(default=0.0, ge=0)
+    """How far all pictures may be shifted alike, by a principal point that is off: constant, considered."""
     picture_shift_px: float = Field(default=0.05, ge=0)
     """How far a whole picture may be shifted: vibration, a late stamp, what compression does to parallel edges."""
     initial_speed_m_s: float = Field(default=0.2, gt=0)
@@ -170,8 +211,14 @@ class FilterSection(Section):
     """Share of true measurements that a gate lets through."""
     ambiguity_ratio: float = Field(default=1e4, gt=1)
     """How many times likelier one of two poses must become before the other is dropped."""
+    one_tilt_rad: float = Field(default=float(np.deg2rad(2.0)), ge=0)
+    """Two poses turned by less against each other are published as one that covers both."""
     reset_after_frames: int = Field(default=5, gt=0)
     """Frames refused in a row, all measurements or the stamp, that make the filter start again."""
+    history_s: float = Field(default=1.0, ge=0)
+    """A frame that comes later than others by up to this is taken at its own time, and they again after it."""
+    output_rate_hz: float | None = Field(default=None, gt=0, le=1000)
+    """Live: propagated states at this rate between frames; None: ten a second, once frames stay away."""
     coast_s: float = Field(default=5.0, gt=0)
     """Longest propagation without measurements before LOST."""
 

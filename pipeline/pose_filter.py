@@ -1,14 +1,17 @@
 """The pose filter's step: each frame's detections in, the relative state of the target out.
 
-No clock, no socket, no file: time is the capture time of what comes in.  A measurement that is not used is named in
-the state's ``rejections``, as "kind: detail", the kinds being "calibration", "stamp", "unknown marker", "corners",
-"pose", "gate" and "update".
+No clock, no socket, no file: time is the capture time of what comes in.  A frame that comes late is taken at its own
+time, and the state of the newest one is published again.  A measurement that is not used is named in
+the state's ``rejections``, as "kind: detail", the kinds being "calibration", "stamp", "map", "unknown marker",
+"corners", "pose", "gate" and "update".
 """
 
 from __future__ import annotations
 
+from bisect import bisect_right, insort
+from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
@@ -17,13 +20,24 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from numpy.typing import NDArray
 
 from astratag.geometry import layer_corners_print
-from astratag.transforms import inverse, transform, wxyz_from_rotation
-from pipeline.convert import NS_PER_S, camera_from_calibration, points_array, pose_matrix, pose_message, vector_message
+from astratag.transforms import inverse, rotation_from_wxyz, transform, wxyz_from_rotation
+from pipeline.convert import (
+    NS_PER_S,
+    camera_from_calibration,
+    points_array,
+    pose_matrix,
+    pose_message,
+    vector_array,
+    vector_message,
+)
 from pipeline.corner_filter import CORNER_DOF, NEAREST_M, Eye, SeenLayer, Update, gate_limit
 from pipeline.corridor import port_to_port
+from pipeline.dynamics import OwnMotion
+from pipeline.history import History
 from pipeline.hypotheses import HypothesisBank, guesses_in_chaser
+from pipeline.map_check import MapCheck, Verdict
 from pipeline.mission import MarkerSection, Mission
-from schemas import Detection, Detections, Mode, RelativeState
+from schemas import ChaserMotion, Detection, Detections, Mode, Quaternion, RelativeState
 from schemas.codec import AnyMessage
 
 Array = NDArray[np.float64]
@@ -33,6 +47,10 @@ NODE = "pose_filter"
 FARTHEST_PX = 1e5
 """A corner farther from the image's origin, or less certain, than this is damaged."""
 FARTHEST_M = 1e5
+OVERDUE_PERIODS = 2.5
+"""A measurement is overdue when it is older than so many usual periods between frames."""
+PERIODS_KEPT = 9
+OWN_KEPT = 256
 
 
 @dataclass
@@ -52,6 +70,27 @@ class Frame:
         self.events.append(event)
 
 
+@dataclass
+class Track:
+    """Everything about the target that a frame changes."""
+
+    map: dict[int, MarkerSection]
+    bank: HypothesisBank | None = None
+    mode: Mode = Mode.INIT
+    t_ns: int | None = None
+    t_measured_ns: int | None = None
+    refused_frames: int = 0
+    """Frames in a row whose measurements were all refused."""
+
+    def copy(self) -> Track:
+        """Return a track of its own that is the same."""
+        return replace(self, bank=None if self.bank is None else self.bank.copy())
+
+    def age_s(self, t_ns: int) -> float | None:
+        """Return how long before ``t_ns`` anything was measured; None when nothing ever was."""
+        return None if self.t_measured_ns is None else max(t_ns - self.t_measured_ns, 0) / NS_PER_S
+
+
 class PoseFilter:
     """Detections in, relative states out: an error-state Kalman filter on the corners of all layers of all markers."""
 
@@ -61,15 +100,28 @@ class PoseFilter:
         self._gate = gate_limit(mission.filter.gate_probability, CORNER_DOF)
         self._eye: Eye | None = None
         self._camera_frame = mission.camera.name
-        self._map = {marker.id: marker for marker in mission.markers}
-        self._bank: HypothesisBank | None = None
-        self._mode = Mode.INIT
-        self._t_ns: int | None = None
-        self._t_measured_ns: int | None = None
-        self._refused_frames = 0
-        """Frames in a row whose measurements were all refused."""
+        self._points: dict[tuple[int, int], Array] = {}
+        """Corners of each marker's layers on the target."""
+        self._map_check = MapCheck(mission)
+        self._track = Track(self._mapped())
+        self._history: History[Detections, Track] = History(round(mission.filter.history_s * NS_PER_S))
+        self._own: list[tuple[int, OwnMotion]] = []
+        """The chaser's own motion from each time on."""
+        self._periods_ns: deque[int] = deque(maxlen=PERIODS_KEPT)
+        self._update: Update | None = None
         self._late_frames = 0
-        """Frames in a row stamped before the last one taken."""
+        """Frames in a row stamped before all that is remembered."""
+
+    @property
+    def innovation(self) -> Array | None:
+        """Return the last frame's innovation in its own standard deviations, None when nothing was used."""
+        return None if self._update is None else self._update.whitened
+
+    @property
+    def tick_period_s(self) -> float | None:
+        """Return the period at which a live run asks for propagated states; None: when frames stay away."""
+        rate_hz = self._settings.output_rate_hz
+        return None if rate_hz is None else 1 / rate_hz
 
     def step(self, message: AnyMessage) -> Iterable[AnyMessage]:
         """Take a calibration, or one frame's detections and return the state, its transforms and any events.
@@ -80,10 +132,12 @@ class PoseFilter:
             self._eye = Eye(camera_from_calibration(message), inverse(self._mission.camera.T_chaser_cam.matrix()))
             self._camera_frame = message.frame_id or self._mission.camera.name
             return []
+        if isinstance(message, ChaserMotion):
+            self._take_own(message)
         if not isinstance(message, Detections):
             return []
         with np.errstate(all="ignore"):  # what overflows is refused where it shows
-            return self._frame(message)
+            return self._take(message)
 
     def refused(self, t_capture_ns: int) -> Iterable[AnyMessage]:
         """Return the state at a frame whose detections could not be read."""
@@ -91,103 +145,184 @@ class PoseFilter:
         return self.step(Detections(t_capture_ns=t_capture_ns, camera=camera, width_px=0, height_px=0, detections=[]))
 
     def tick(self, t_ns: int) -> Iterable[AnyMessage]:
-        """Return the state propagated to ``t_ns``, when no frame came for a while; nothing when there is none.
+        """Return the state propagated to ``t_ns``; nothing when there is none.
 
-        The filter itself stays at its last frame, so that a frame on its way is not refused for its age.
+        The mode is COAST once a frame is overdue.  The filter itself stays at its last frame, so that a frame on its
+        way is not refused for its age.
         """
-        if self._bank is None or self._t_ns is None or t_ns <= self._t_ns:
+        track = self._track
+        if track.bank is None or track.t_ns is None or t_ns <= track.t_ns:
             return []
         frame = Frame(t_ns)
-        self._lose_when_old(frame)
-        coasted = self._bank
-        if coasted is not None:
-            coasted = coasted.copy()
-            coasted.predict((t_ns - self._t_ns) / NS_PER_S, self._age_s(t_ns) or 0.0)
-            self._settle_mode(frame)
-        return self._answer(frame, coasted)
+        self._lose_when_old(track, frame)
+        if track.bank is None:
+            self._history.clear()
+            return self._answer(track, frame, None)
+        coasted = track.copy()
+        self._predict(coasted, t_ns)
+        age_s = track.age_s(t_ns)
+        if age_s is None or age_s > self._overdue_s():
+            self._settle_mode(track, frame)
+        return self._answer(track, frame, coasted.bank)
 
-    def _frame(self, message: Detections) -> list[AnyMessage]:
-        frame = Frame(message.t_capture_ns)
-        if not self._take_stamp(frame):
-            return self._answer(frame, self._bank)
-        groups = self._usable_layers(message, frame)
-        if self._bank is not None:
-            self._track([layer for _, layers in groups for layer in layers], frame)
-        if self._bank is None:
-            self._acquire(groups, frame)
-        if frame.used:
-            self._t_measured_ns = frame.t_ns
-        self._settle_mode(frame)
-        return self._answer(frame, self._bank)
+    def _overdue_s(self) -> float:
+        """Return the age from which on a measurement is overdue."""
+        return OVERDUE_PERIODS * float(np.median(self._periods_ns)) / NS_PER_S if self._periods_ns else 0.0
 
-    def _take_stamp(self, frame: Frame) -> bool:
-        """Bring the filter to the frame's time; False when that is not after the last one's."""
-        if self._t_ns is not None and frame.t_ns <= self._t_ns:
-            return self._refuse_stamp(frame, self._t_ns)
-        if self._bank is not None and self._t_ns is not None:
-            self._lose_when_old(frame)
-            if self._bank is not None:
-                self._bank.predict((frame.t_ns - self._t_ns) / NS_PER_S, self._age_s(frame.t_ns) or 0.0)
-        self._t_ns = frame.t_ns
-        self._late_frames = 0
-        return True
+    def _take(self, message: Detections) -> list[AnyMessage]:
+        """Take one frame in, whenever it comes."""
+        t_ns, last_ns = message.t_capture_ns, self._track.t_ns
+        frame = Frame(t_ns)
+        verdict = self._judged(message)
+        if verdict.refused:
+            frame.rejections += verdict.refused.values()
+            kept = [seen for seen in message.detections if seen.marker_id not in verdict.refused]
+            message = message.model_copy(update={"detections": kept})
+        if last_ns is None or t_ns > last_ns:
+            if last_ns is not None:
+                self._periods_ns.append(t_ns - last_ns)
+            self._late_frames = 0
+            self._advance(message, frame)
+        elif t_ns == last_ns or self._history.holds(t_ns):
+            frame.t_ns = last_ns
+            which = "the last frame's" if t_ns == last_ns else "that of a frame before"
+            frame.rejections.append(f"stamp: the same as {which}")
+        elif self._history.reaches(t_ns):
+            self._take_late(message, frame, last_ns)
+        elif not self._is_set_back(frame, last_ns):
+            frame.t_ns = last_ns
+        else:
+            self._advance(message, frame)
+        self._update = frame.update
+        for text in verdict.events:
+            frame.log(Log.WARNING, text)
+        return self._answer(self._track, frame, self._track.bank)
 
-    def _refuse_stamp(self, frame: Frame, last_ns: int) -> bool:
-        """Refuse a frame that is not after the last one; True when so many came that the clock was set back."""
-        if frame.t_ns == last_ns:
-            frame.rejections.append("stamp: the same as the last frame's")
-            return False
+    def _judged(self, message: Detections) -> Verdict:
+        """Return which markers contradict the map, once for each frame that comes."""
+        if self._eye is None or (message.width_px, message.height_px) != self._eye.size_px:
+            return Verdict()
+        return self._map_check.take(message, self._eye.camera)
+
+    def _take_late(self, message: Detections, frame: Frame, last_ns: int) -> None:
+        """Go back to before a late frame, take it, and then again all that had come since."""
+        before = self._track.mode
+        self._track, later = self._history.rewind(message.t_capture_ns)
+        self._track = self._track.copy()
+        self._advance(message, frame)
+        for _, again in later:
+            self._advance(again, Frame(again.t_capture_ns))
+        frame.t_ns, frame.events = last_ns, []
+        self._tell_mode(self._track, before, frame)
+
+    def _is_set_back(self, frame: Frame, last_ns: int) -> bool:
+        """Refuse a frame from before all that is remembered; True when so many came that the clock was set back."""
         self._late_frames += 1
         frame.rejections.append(f"stamp: {(last_ns - frame.t_ns) / NS_PER_S:.6f} s before the last frame's")
         if self._late_frames < self._settings.reset_after_frames:
-            frame.t_ns = last_ns
             return False
-        self._lose(frame, f"{self._late_frames} frames in a row from before the last one: the clock was set back")
-        self._t_ns, self._late_frames = frame.t_ns, 0
+        why = f"{self._late_frames} frames in a row from before the last one: the clock was set back"
+        self._lose(self._track, frame, why)
+        self._history.clear()
+        self._track.t_ns, self._late_frames = None, 0
+        self._periods_ns.clear()
         return True
 
-    def _usable_layers(self, message: Detections, frame: Frame) -> list[tuple[Detection, list[SeenLayer]]]:
+    def _advance(self, message: Detections, frame: Frame) -> None:
+        """Take in the frame that follows the track's last one, and remember it."""
+        track = self._track
+        if track.bank is not None:
+            self._lose_when_old(track, frame)
+        if track.bank is not None:
+            self._predict(track, frame.t_ns)
+        track.t_ns = frame.t_ns
+        groups = self._usable_layers(track, message, frame)
+        if track.bank is not None:
+            self._follow(track, [layer for _, layers in groups for layer in layers], frame)
+        if track.bank is None:
+            self._acquire(track, groups, frame)
+        if frame.used:
+            track.t_measured_ns = frame.t_ns
+        self._settle_mode(track, frame)
+        self._history.append(frame.t_ns, message, track.copy())
+
+    def _predict(self, track: Track, t_ns: int) -> None:
+        """Propagate to ``t_ns``, by what the chaser did meanwhile if that is known."""
+        assert track.bank is not None and track.t_ns is not None
+        unseen_s, now_ns = track.age_s(t_ns) or 0.0, track.t_ns
+        at = bisect_right(self._own, now_ns, key=lambda known: known[0])
+        own = self._own[at - 1][1] if at else None
+        for change_ns, then in self._own[at:]:
+            if change_ns >= t_ns:
+                break
+            track.bank.predict((change_ns - now_ns) / NS_PER_S, unseen_s, own)
+            if own is not None:
+                track.bank.observe_from(own, then)
+            now_ns, own = change_ns, then
+        track.bank.predict((t_ns - now_ns) / NS_PER_S, unseen_s, own)
+
+    def _take_own(self, message: ChaserMotion) -> None:
+        """Note the chaser's own motion from its time on; what it says of times gone by counts for late frames only."""
+        drift = OwnMotion.of(self._settings.drift)
+        own = OwnMotion(
+            drift.R_hill_chaser
+            if message.rotation_hill_chaser_wxyz is None
+            else _rotation(message.rotation_hill_chaser_wxyz),
+            vector_array(message.omega_hill_chaser_in_chaser_rad_s),
+            vector_array(message.acceleration_chaser_m_s2),
+        )
+        insort(self._own, (message.t_capture_ns, own), key=lambda known: known[0])
+        del self._own[:-OWN_KEPT]
+
+    def _usable_layers(
+        self, track: Track, message: Detections, frame: Frame
+    ) -> list[tuple[Detection, list[SeenLayer]]]:
         """Return the measured layers of each detection that is on the target."""
         if self._eye is None:
             if message.detections:
                 frame.rejections.append("calibration: none yet")
             return []
-        camera = self._eye.camera
-        if (message.width_px, message.height_px) != (camera.width, camera.height):
+        if (message.width_px, message.height_px) != self._eye.size_px:
+            width, height = self._eye.size_px
             frame.rejections.append(
-                f"calibration: for {camera.width}x{camera.height}, the frame is {message.width_px}x{message.height_px}"
+                f"calibration: for {width}x{height}, the frame is {message.width_px}x{message.height_px}"
             )
             return []
         groups = []
         for detection in message.detections:
-            marker = self._marker(detection.marker_id)
+            marker = self._marker(track, detection.marker_id)
             if marker is None:
                 frame.rejections.append(f"unknown marker: {detection.marker_id} is not on the target")
                 continue
             layers = []
             for seen in detection.layers:
                 corners_px = points_array(seen.corners_px)
-                if np.abs(corners_px).max() > FARTHEST_PX or seen.sigma_px > FARTHEST_PX:
+                if not (np.abs(corners_px).max() < FARTHEST_PX and 0 < seen.sigma_px < FARTHEST_PX):
                     frame.rejections.append(f"corners: marker {marker.id} layer {seen.layer} is out of bounds")
                     continue
                 sigma_px = max(seen.sigma_px, self._settings.corner_floor_px)
-                points = corners_on_target(marker, seen.layer)
-                layers.append(SeenLayer(marker.id, seen.layer, corners_px, sigma_px, points))
+                layers.append(SeenLayer(marker.id, seen.layer, corners_px, sigma_px, self._corners(marker, seen.layer)))
             if layers:
                 groups.append((detection, layers))
         return groups
 
-    def _marker(self, marker_id: int) -> MarkerSection | None:
+    def _marker(self, track: Track, marker_id: int) -> MarkerSection | None:
         """Return a marker of the target; without a map, any until the first is taken for the target."""
-        if not self._map:
+        if not track.map:
             return MarkerSection(id=marker_id, side_m=self._mission.default_side_m)
-        return self._map.get(marker_id)
+        return track.map.get(marker_id)
 
-    def _track(self, layers: list[SeenLayer], frame: Frame) -> None:
+    def _corners(self, marker: MarkerSection, layer: int) -> Array:
+        key = (marker.id, layer)
+        if key not in self._points:
+            self._points[key] = corners_on_target(marker, layer)
+        return self._points[key]
+
+    def _follow(self, track: Track, layers: list[SeenLayer], frame: Frame) -> None:
         """Update with the layers that pass the gate; start afresh when nothing has passed for too long."""
-        if not layers or self._bank is None or self._eye is None:
+        if not layers or track.bank is None or self._eye is None:
             return
-        distances = self._bank.gate(layers, self._eye)
+        distances = track.bank.gate(layers, self._eye)
         for layer, distance in zip(layers, distances, strict=True):
             if distance <= self._gate:
                 frame.used.append(layer)
@@ -196,92 +331,97 @@ class PoseFilter:
                     f"gate: marker {layer.marker_id} layer {layer.layer}, {distance:.1f} > {self._gate:.1f}"
                 )
         if frame.used:
-            frame.update = self._bank.update(frame.used, self._eye)
+            frame.update = track.bank.update(frame.used, self._eye)
             if frame.update is None:
                 frame.rejections.append("update: the corners lead to no pose")
                 frame.used = []
-        self._refused_frames = 0 if frame.used else self._refused_frames + 1
-        if self._refused_frames >= self._settings.reset_after_frames:
-            self._lose(frame, f"all measurements of {self._refused_frames} frames in a row refused")
+        track.refused_frames = 0 if frame.used else track.refused_frames + 1
+        if track.refused_frames >= self._settings.reset_after_frames:
+            self._lose(track, frame, f"all measurements of {track.refused_frames} frames in a row refused")
 
-    def _acquire(self, groups: list[tuple[Detection, list[SeenLayer]]], frame: Frame) -> None:
+    def _acquire(self, track: Track, groups: list[tuple[Detection, list[SeenLayer]]], frame: Frame) -> None:
         """Start from the marker with the most layers, the largest of them."""
         if self._eye is None or not groups:
             return
         detection, layers = max(groups, key=lambda group: (len(group[1]), _extent_px(group[1][0].corners_px)))
-        marker = self._marker(detection.marker_id)
+        marker = self._marker(track, detection.marker_id)
         assert marker is not None
         poses = first_guesses(detection)
         if not poses:
             frame.rejections.append(f"pose: marker {marker.id} came without one to start from")
             return
-        guesses = guesses_in_chaser(poses, self._eye, inverse(marker.T_target_marker.matrix()))
-        self._bank = HypothesisBank.start(guesses, layers, self._eye, self._settings)
-        if self._bank is None:
+        T_target_marker = marker.T_target_marker.matrix()
+        guesses = guesses_in_chaser(poses, self._eye, inverse(T_target_marker))
+        track.bank = HypothesisBank.start(guesses, layers, self._eye, self._settings, T_target_marker)
+        if track.bank is None:
             frame.rejections.append(f"pose: none fits the corners of marker {marker.id}")
             return
-        self._map = self._map or {marker.id: marker}
-        self._refused_frames = 0
+        track.map = track.map or {marker.id: marker}
+        track.refused_frames = 0
         frame.used = layers
         frame.log(
             Log.INFO,
             f"acquired marker {marker.id}, {np.linalg.norm(poses[0][:3, 3]):.3f} m from the camera, "
-            f"{len(self._bank.filters)} possible {'poses' if self._bank.is_ambiguous else 'pose'}",
+            f"{len(track.bank.filters)} possible {'pose' if len(track.bank.filters) == 1 else 'poses'}",
         )
 
-    def _lose_when_old(self, frame: Frame) -> None:
+    def _lose_when_old(self, track: Track, frame: Frame) -> None:
         """Drop the state when its last measurement is too long ago."""
-        age_s = self._age_s(frame.t_ns)
+        age_s = track.age_s(frame.t_ns)
         if age_s is not None and age_s > self._settings.coast_s:
-            self._lose(frame, f"no measurement for {age_s:.2f} s")
+            self._lose(track, frame, f"no measurement for {age_s:.2f} s")
 
-    def _lose(self, frame: Frame, why: str) -> None:
-        self._bank = None
-        self._map = {marker.id: marker for marker in self._mission.markers}
-        self._refused_frames = 0
-        if self._mode != Mode.INIT:
-            self._mode = Mode.LOST
+    def _lose(self, track: Track, frame: Frame, why: str) -> None:
+        track.bank = None
+        track.map = self._mapped()
+        track.refused_frames = 0
+        if track.mode != Mode.INIT:
+            track.mode = Mode.LOST
             frame.log(Log.ERROR, f"LOST: {why}")
 
-    def _settle_mode(self, frame: Frame) -> None:
+    def _settle_mode(self, track: Track, frame: Frame) -> None:
         """Name what the state is worth now, and tell when that changed."""
-        if self._bank is None:
+        if track.bank is None:
             return
-        before = self._mode
-        if self._bank.is_ambiguous:
-            self._mode = Mode.AMBIGUOUS
+        before = track.mode
+        if track.bank.is_ambiguous:
+            track.mode = Mode.AMBIGUOUS
         else:
-            self._mode = Mode.TRACK if frame.used else Mode.COAST
-        if self._mode == before:
+            track.mode = Mode.TRACK if frame.used else Mode.COAST
+        self._tell_mode(track, before, frame)
+
+    def _tell_mode(self, track: Track, before: Mode, frame: Frame) -> None:
+        if track.mode == before or track.mode not in WHY:
             return
-        level = Log.INFO if self._mode == Mode.TRACK else Log.WARNING
-        frame.log(level, f"{self._mode.name}: {WHY[self._mode]} (was {before.name})")
+        level = Log.INFO if track.mode == Mode.TRACK else Log.WARNING
+        frame.log(level, f"{track.mode.name}: {WHY[track.mode]} (was {before.name})")
 
-    def _age_s(self, t_ns: int) -> float | None:
-        return None if self._t_measured_ns is None else max(t_ns - self._t_measured_ns, 0) / NS_PER_S
+    def _mapped(self) -> dict[int, MarkerSection]:
+        return {marker.id: marker for marker in self._mission.markers}
 
-    def _answer(self, frame: Frame, bank: HypothesisBank | None) -> list[AnyMessage]:
+    def _answer(self, track: Track, frame: Frame, bank: HypothesisBank | None) -> list[AnyMessage]:
         if bank is None:
             state = RelativeState(
                 t_capture_ns=frame.t_ns,
-                mode=self._mode,
-                age_s=self._age_s(frame.t_ns),
+                mode=track.mode,
+                age_s=track.age_s(frame.t_ns),
                 rejections=frame.rejections,
             )
             return [state, *frame.events]
-        motion = bank.best.motion
+        estimate = bank.estimate
+        motion = estimate.motion
         T_chaser_target = motion.pose_chaser_target()
         v, omega = motion.v_chaser_target_m_s, motion.omega_chaser_target_in_target_rad_s
         state = RelativeState(
             t_capture_ns=frame.t_ns,
-            mode=self._mode,
+            mode=track.mode,
             T_chaser_target=pose_message(T_chaser_target),
             v_chaser_target_m_s=vector_message(v),
             omega_chaser_target_in_target_rad_s=vector_message(omega),
-            covariance=bank.best.message_covariance().ravel().tolist(),
+            covariance=estimate.message_covariance().ravel().tolist(),
             nis=None if frame.update is None else frame.update.nis,
             nis_dof=0 if frame.update is None else frame.update.dof,
-            age_s=self._age_s(frame.t_ns),
+            age_s=track.age_s(frame.t_ns),
             hypothesis_probability=bank.probability,
             marker_ids=[layer.marker_id for layer in frame.used],
             layers=[layer.layer for layer in frame.used],
@@ -330,3 +470,7 @@ def first_guesses(detection: Detection) -> list[Array]:
 
 def _extent_px(corners_px: Array) -> float:
     return float(np.ptp(corners_px, axis=0).max())
+
+
+def _rotation(q: Quaternion) -> Array:
+    return rotation_from_wxyz((q.w, q.x, q.y, q.z))

@@ -22,6 +22,7 @@ from rich.table import Table
 from pipeline.convert import pose_matrix
 from pipeline.expected import is_false, visible_layers
 from pipeline.run import POSE_DOF, STATE_DOF, Row, Run, load_run
+from pipeline.run_bound import BoundBin, bound_bins, nis_correlation
 from schemas import Mode
 
 NEAR_M = 0.5
@@ -106,6 +107,10 @@ class Summary(Section):
     """The same of pose, velocity and rate together."""
     nis_mean: float | None
     """Normalised innovation squared per degree of freedom."""
+    nis_correlation: float | None = None
+    """Of NIS from one frame to the next: near 0 when innovations are white."""
+    bound: list[BoundBin] | None = None
+    """By range: errors beside the posterior Cramer-Rao bound of the measured corners."""
     states_wrong: int | None
     """States in TRACK or COAST that were grossly wrong."""
     covariances_invalid: int
@@ -149,6 +154,8 @@ def score_run(run: Run) -> Summary:
         nees_mean=_mean(row.nees_per_dof(POSE_DOF) for row in scored),
         nees_12_mean=_mean(row.nees_per_dof(STATE_DOF) for row in scored),
         nis_mean=sum(value for value, _ in nis) / sum(dof for _, dof in nis) if nis else None,
+        nis_correlation=nis_correlation(run),
+        bound=bound_bins(run),
         states_wrong=sum(_is_wrong(row) for row in scored) if run.has_truth else None,
         covariances_invalid=sum(row.covariance_valid is False for row in run.rows),
         modes=seconds_by_mode(run.modes),
@@ -310,12 +317,26 @@ def _table_rows(s: Summary) -> list[tuple[str, str]]:
     return [
         *lines,
         ("NEES per dof", "" if s.nees_mean is None else f"{s.nees_mean:.2f} pose, {s.nees_12_mean or 0:.2f} state"),
-        ("NIS per dof", "" if s.nis_mean is None else f"{s.nis_mean:.2f}"),
+        ("NIS per dof", _nis_text(s)),
+        *(("  position and bound", _bound_text(part)) for part in s.bound or ()),
         ("latency", "" if latency.p50 is None else f"p50 {latency.p50:.1f} ms, p99 {latency.p99:.1f} ms"),
         ("refused by the filter", _listed(s.rejections)),
         ("dropped frames", f"{s.dropped}"),
         ("wall time", f"{s.wall_s:.1f} s, {s.frames / s.wall_s:.0f} frames/s" if s.wall_s > 0 else ""),
     ]
+
+
+def _nis_text(s: Summary) -> str:
+    if s.nis_mean is None:
+        return ""
+    return f"{s.nis_mean:.2f}" + ("" if s.nis_correlation is None else f", correlated by {s.nis_correlation:+.2f}")
+
+
+def _bound_text(part: BoundBin) -> str:
+    return (
+        f"{part.farthest_m:.3g} to {part.nearest_m:.3g} m: {part.position_rms_m * 1e3:.3f} mm, "
+        f"{part.position_bound_m * 1e3:.3f} mm allowed"
+    )
 
 
 def _listed(counts: dict[str, int]) -> str:

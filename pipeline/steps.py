@@ -12,7 +12,7 @@ from typing import Protocol
 from pipeline.mission import Mission
 from schemas import Envelope, Topic
 from schemas.codec import AnyMessage
-from schemas.topics import ANNOTATIONS, CALIBRATION, DETECTIONS, EVENTS, FRAME, STATE, TRANSFORMS
+from schemas.topics import ANNOTATIONS, CALIBRATION, CHASER_MOTION, DETECTIONS, EVENTS, FRAME, STATE, TRANSFORMS
 
 
 class Step(Protocol):
@@ -64,5 +64,5 @@ def _pose_filter(mission: Mission) -> Step:
 # Imported when built: each process loads only its own step's libraries.
 STEPS = (
     StepSpec("detector", (CALIBRATION, FRAME), (DETECTIONS, ANNOTATIONS), _detector),
-    StepSpec("pose_filter", (CALIBRATION, DETECTIONS), (STATE, TRANSFORMS, EVENTS), _pose_filter),
+    StepSpec("pose_filter", (CALIBRATION, DETECTIONS, CHASER_MOTION), (STATE, TRANSFORMS, EVENTS), _pose_filter),
 )

@@ -16,6 +16,7 @@ Frames, units and conventions, said once for every message:
 from schemas.codec import CodecError, decode, encode
 from schemas.envelope import Envelope, Stamp
 from schemas.messages import (
+    ChaserMotion,
     Detection,
     Detections,
     Guidance,
@@ -38,6 +39,7 @@ from schemas.topics import TOPICS, Topic, topic_of
 
 __all__ = [
     "TOPICS",
+    "ChaserMotion",
     "CodecError",
     "Detection",
     "Detections",

@@ -188,6 +188,17 @@ class Truth(Message):
     omega_chaser_target_in_target_rad_s: Vector3 = number(4)
 
 
+class ChaserMotion(Message):
+    """What the chaser knows of its own motion: it holds from its time on until the next one."""
+
+    t_capture_ns: int = number(1)
+    rotation_hill_chaser_wxyz: Quaternion | None = number(2, default=None)
+    """Its attitude in the Hill frame; absent: the mission's."""
+    omega_hill_chaser_in_chaser_rad_s: Vector3 = number(3)
+    acceleration_chaser_m_s2: Vector3 = number(4)
+    """By its thrusters, chaser axes."""
+
+
 class Phase(IntEnum):
     """What the chaser's guidance is doing."""
 

@@ -12,7 +12,7 @@ from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from schemas.codec import AnyMessage
-from schemas.messages import Detections, Guidance, NodeHealth, RelativeState, Truth
+from schemas.messages import ChaserMotion, Detections, Guidance, NodeHealth, RelativeState, Truth
 
 
 @dataclass(frozen=True)
@@ -55,10 +55,23 @@ STATE = Topic("state", "relnav/{vehicle}/state", RelativeState, "camera", per_fr
 TRANSFORMS = Topic("transforms", "relnav/{vehicle}/transforms", FrameTransforms, "camera")
 TRUTH = Topic("truth", "relnav/{vehicle}/truth", Truth, "camera")
 GUIDANCE = Topic("guidance", "relnav/{vehicle}/gnc/guidance", Guidance, "camera")
+CHASER_MOTION = Topic("chaser motion", "relnav/{vehicle}/gnc/chaser_motion", ChaserMotion, "camera")
 EVENTS = Topic("events", "relnav/{vehicle}/events", Log, "on change")
 HEALTH = Topic("health", "relnav/{vehicle}/@node/{node}/health", NodeHealth, "1 Hz")
 
-TOPICS = (FRAME, CALIBRATION, ANNOTATIONS, DETECTIONS, STATE, TRANSFORMS, TRUTH, GUIDANCE, EVENTS, HEALTH)
+TOPICS = (
+    FRAME,
+    CALIBRATION,
+    ANNOTATIONS,
+    DETECTIONS,
+    STATE,
+    TRANSFORMS,
+    TRUTH,
+    GUIDANCE,
+    CHASER_MOTION,
+    EVENTS,
+    HEALTH,
+)
 _BY_SCHEMA = {topic.schema: topic for topic in TOPICS}
 
 

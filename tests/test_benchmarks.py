@@ -1,6 +1,8 @@
-"""A cell of every kind of the detection benchmark runs, and its peers' artwork and corners are where they should be."""
+"""A cell of every kind of the benchmarks runs, and the peers' artwork and corners are where they should be."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +15,8 @@ from benchmarks.detection.peers import ENTRANTS, MARKERS, TRACKED, Entrant, text
 from benchmarks.detection.profile import measure_profile
 from benchmarks.detection.recall import SIZES, measure, wilson
 from benchmarks.detection.scenes import CONDITIONS, SHEET_M, Scene, draw
+from benchmarks.filter.__main__ import SMALL, consistency, plot
+from benchmarks.filter.simulate import simulate
 
 SEED = 5
 QUICK = tuple(entrant for entrant in ENTRANTS if entrant.needs in ("astratag", "cv2"))
@@ -84,3 +88,15 @@ def test_cells_of_texture_are_worth_what_the_detector_takes_them_for():
 @pytest.mark.parametrize(("found", "images", "low", "high"), [(0, 10, 0.0, 0.2775), (10, 10, 0.7225, 1.0)])
 def test_wilson_bounds_against_the_closed_form(found, images, low, high):
     assert wilson(found, images) == pytest.approx((low, high), abs=1e-4)
+
+
+def test_a_short_flight_of_the_filter_benchmark_is_at_its_bound(tmp_path):
+    """Four seconds from 0.5 m on, two runs: NEES near 1, and RMS not far from the bound, for so few."""
+    case = replace(SMALL, ranges_m=(0.5, 0.4, 0.3), duration_s=4.0, limits=(1.15, 1.15))
+    samples = simulate(case, 2, first_seed=SEED)
+    rms, bound = (np.sqrt(np.mean(values, axis=0)) for values in (samples.squares, samples.bounds))
+    assert (rms < 2.5 * bound).all()
+    assert 0.4 < np.mean(samples.nees) / 12 < 2
+    assert "NEES" in consistency(case, samples, 2)
+    plot([(case, samples)], tmp_path / "filter.png")
+    assert (tmp_path / "filter.png").stat().st_size > 0

@@ -8,9 +8,9 @@ from schemas import Message, Mode, Point2, Quaternion, Vector3
 from schemas.codec import FieldPlan, all_models, field_plans
 from schemas.messages import Pose
 
-UNIT = re.compile(r"\w+_(m|px|rad|s|ns|m_s|rad_s|n|n_m)")
+UNIT = re.compile(r"\w+_(m|px|rad|s|ns|m_s|m_s2|rad_s|n|n_m)")
 TRANSFORM = re.compile(r"T_[a-z]+_[a-z]+")
-LAYOUT = {("Pose", "rotation_wxyz"): Quaternion}
+LAYOUT = {("ChaserMotion", "rotation_hill_chaser_wxyz"): Quaternion, ("Pose", "rotation_wxyz"): Quaternion}
 """Fields whose name ends in the layout of their numbers instead of a unit."""
 DIMENSIONLESS = {
     "Detection.correlation": "of bits, -1 to 1",

@@ -100,8 +100,15 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
             Mission.load(path)
 
 
-UNITLESS = {"gate_probability", "ambiguity_ratio", "rotation_wxyz"}
-"""Probabilities, ratios and a quaternion, whose name is its layout."""
+UNITLESS = {
+    "gate_probability",
+    "ambiguity_ratio",
+    "rotation_wxyz",
+    "R_hill_chaser_wxyz",
+    "scale_sigma",
+    "target_inertia",
+}
+"""Probabilities, ratios, and quaternions, whose names are their layout."""
 
 
 @pytest.mark.parametrize(
@@ -115,4 +122,4 @@ def test_every_physical_setting_ends_in_a_unit(section: type[BaseModel]) -> None
         if info.annotation is PoseSection:
             assert re.fullmatch(r"T_[a-z]+_[a-z]+", name)
         elif "float" in kind:
-            assert re.fullmatch(r"\w+_(m|rad|s|px|m_s|rad_s|m_s2|rad_s2)", name) or name in UNITLESS, name
+            assert re.fullmatch(r"\w+_(m|rad|s|px|m_s|rad_s|m_s2|rad_s2|hz)", name) or name in UNITLESS, name

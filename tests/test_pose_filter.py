@@ -11,13 +11,16 @@ from hypothesis import strategies as st
 
 from astratag.camera import Camera
 from astratag.transforms import difference, exp_so3, inverse, pose, transform
+from nodes.bus import Received
+from nodes.step_host import StepWork
 from pipeline.convert import pose_matrix, pose_message, vector_array
 from pipeline.corner_filter import Eye, SeenLayer, outward_shift, predicted_corners
 from pipeline.dynamics import STATES, Motion
 from pipeline.hypotheses import mirrored_pose
-from pipeline.mission import FlatSection, Mission
+from pipeline.mission import FilterSection, FlatSection, Mission
 from pipeline.pose_filter import PoseFilter, corners_on_target
-from schemas import Detection, Detections, LayerCorners, Mode, Point2, RelativeState, encode
+from pipeline.steps import STEPS
+from schemas import Detection, Detections, Envelope, LayerCorners, Mode, Point2, RelativeState, Stamp, encode
 from tests.approach import CALIBRATION, CAMERA, MARKER, T0_NS, approach, detection, detections, mission, truth
 
 HZ = 15.0
@@ -201,6 +204,42 @@ def test_tick_coasts_without_moving_the_filter():
     assert list(pose_filter.tick(t_ns + 11_000_000_000)) == []
 
 
+def test_coast_means_that_a_frame_is_overdue():
+    """At 5 Hz: still TRACK one and two periods after the last frame, with growing covariance; COAST after three."""
+    mission_, rng, motion = mission(), np.random.default_rng(4), approach(4)
+    pose_filter = started(mission_)
+    last = follow(pose_filter, mission_, motion, np.arange(25, 40) / 5, rng)[-1]
+    sizes, modes = [], []
+    for late_s in (0.2, 0.3, 0.4, 0.6):
+        state = state_of(pose_filter.tick(last.t_capture_ns + round(late_s * 1e9)))
+        modes.append(state.mode)
+        sizes.append(np.trace(covariance(state)))
+        assert state.age_s == pytest.approx(late_s)
+    assert modes == [Mode.TRACK] * 3 + [Mode.COAST]
+    assert sizes == sorted(sizes)
+    assert follow(pose_filter, mission_, motion, [8.6], rng)[0].mode == Mode.TRACK
+
+
+def test_a_live_run_propagates_at_the_rate_of_the_mission():
+    """Ten states between two frames at 5 Hz when asked for 50 Hz, none of them a change of mode."""
+    mission_ = mission(filter=FilterSection(output_rate_hz=50.0))
+    work = StepWork(next(spec for spec in STEPS if spec.name == "pose_filter"), mission_, lossless=False)
+
+    def take(message, t_ns):
+        envelope = Envelope.wrap(message, Stamp(0, t_ns, t_ns), vehicle="chaser", camera="nav")
+        return list(work.handle(Received(envelope, t_ns)))
+
+    take(CALIBRATION, T0_NS)
+    for k in range(5):
+        seen = detection(mission_, truth(mission_, approach(4).at(k / 5)).T_a_b, sigma_px=SIGMA_PX)
+        take(detections(k / 5, seen), T0_NS + k * 200_000_000)
+    t_last_ns = T0_NS + 800_000_000
+    between = [e.message() for ms in range(1, 200) for e in work.idle(t_last_ns + ms * 1_000_000)]
+    found = [message for message in between if isinstance(message, RelativeState)]
+    assert [(s.t_capture_ns - t_last_ns) // 1_000_000 for s in found] == list(range(20, 200, 20))
+    assert {s.mode for s in found} == {Mode.TRACK}
+
+
 def test_an_unknown_marker_is_refused():
     """A false id beside the true marker changes nothing but the rejections."""
     mission_, motion = mission(), approach(5)
@@ -297,14 +336,14 @@ def test_without_a_map_the_first_marker_is_the_target():
 
 
 def test_stamps_that_do_not_advance_are_refused():
-    """A duplicate and a late frame leave the state as it is, with the reason; a clock set back starts afresh."""
+    """A duplicate and a too late frame leave the state as it is, with the reason; a clock set back starts afresh."""
     mission_, rng, motion = mission(), np.random.default_rng(11), approach(11)
     pose_filter = started(mission_)
     last = follow(pose_filter, mission_, motion, frames(4, 6), rng)[-1]
     t_s = float(frames(4, 6)[-1])
     (twice,) = follow(pose_filter, mission_, motion, [t_s], rng)
-    (late,) = follow(pose_filter, mission_, motion, [t_s - 0.05], rng)
-    for state, reason in ((twice, "stamp: the same as the last frame's"), (late, "stamp: 0.050000 s before")):
+    (late,) = follow(pose_filter, mission_, motion, [t_s - 1.5], rng)
+    for state, reason in ((twice, "stamp: the same as the last frame's"), (late, "stamp: 1.500000 s before")):
         assert state.rejections[0].startswith(reason)
         assert (state.T_chaser_target, state.covariance, state.t_capture_ns, state.mode) == (
             last.T_chaser_target,

@@ -1,0 +1,1 @@
+"""How accurate, how honest and how fast the pose filter is, on simulated corners; ``python -m benchmarks.filter``."""
