@@ -22,6 +22,7 @@ from astratag.warp import PoseWarp, on_surface, pose_jacobian, seen_from
 Array = NDArray[np.float64]
 
 _SQUARES = [square(*layer.black) for layer in LAYERS]
+REFINEMENT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 6, 1e-8)
 MAX_STEPS = 30
 NEAREST_M = 1e-6
 """A point behind the camera is taken for one so near: far outside every image."""
@@ -155,9 +156,22 @@ def _squared_errors(poses: Array, points_marker: Array, seen_px: Array, lens: Ar
 
 
 def _refined(camera: Camera, T_cam_marker: Array, points_marker: Array, seen_px: Array) -> Array:
-    """Return a pose refined on points (3, N) of the marker seen at (N, 2) pixels; as it was where that fails."""
-    refined = _adjusted(T_cam_marker, points_marker, seen_px, np.ones(len(seen_px)), camera.lens)[0]
-    return refined if np.isfinite(refined).all() and refined[2, 3] > 0 else T_cam_marker
+    """Return a pose refined on points (3, N) of the marker seen at (N, 2) pixels; as it was where that fails.
+
+    In few steps: near to where one pose explains what is seen, further ones would lead the other to it.
+    """
+    rotation, translation = cv2.solvePnPRefineLM(
+        np.ascontiguousarray(points_marker.T),
+        seen_px,
+        camera.K,
+        camera.distortion,
+        cv2.Rodrigues(T_cam_marker[:3, :3])[0],
+        T_cam_marker[:3, 3:].copy(),
+        REFINEMENT,
+    )
+    if not np.isfinite(rotation).all() or translation[2, 0] <= 0:
+        return T_cam_marker
+    return pose(cv2.Rodrigues(rotation)[0], translation)
 
 
 def refine_on_corners(start: PoseWarp, layers: Sequence[LayerDetection]) -> CornerPose:
