@@ -31,10 +31,10 @@ from astratag.curved import (
     seen_whole,
 )
 from astratag.cylinder import CylinderWarp
-from astratag.describe import LEAST_POLISHED, PIXEL_BLUR, SQUARES, WARPS, Describer, inside, lead
+from astratag.describe import LEAST_POLISHED, PIXEL_BLUR, WARPS, Describer, inside, lead
 from astratag.detection import Detection, LayerDetection
 from astratag.fit import follows_all_sides
-from astratag.geometry import LAYERS, Layer, layer_points, square
+from astratag.geometry import LAYERS, SQUARES, Layer, layer_points
 from astratag.grow import CURVED_GAIN, Fit, fit_own_edges, grow, layer_side_px, settle
 from astratag.layers import measure_layers
 from astratag.matching import Rough, match
@@ -267,7 +267,7 @@ class Confirmer(Describer):
             return candidate.warp.of_whole(self.spec(candidate.reading.marker_id).side_m, LAYERS[layer].scale)
         if candidate.bent:
             return BentWarp.from_points(layer_points(KNOTS, LAYERS[layer]), candidate.warp(KNOTS))
-        return HomographyWarp.from_points(square(*LAYERS[layer].black), candidate.corners_px)
+        return HomographyWarp.from_points(SQUARES[layer], candidate.corners_px)
 
     def _fit(self, view: View, candidate: Candidate, layer: int) -> Fit | None:
         """Return the fit of a whole marker begun at one layer, None as soon as its code is not read there."""
@@ -291,7 +291,7 @@ class Confirmer(Describer):
     def _starts(self, view: View, candidate: Candidate, layer: int) -> Iterator[FittedWarp]:
         """Yield warps to start fitting from when the candidate is ``layer`` of its marker."""
         spec = self.spec(candidate.reading.marker_id)
-        template = square(*LAYERS[layer].black)
+        template = SQUARES[layer]
         if view.camera is not None and spec.surface is not None:
             knots = layer_points(KNOTS, LAYERS[layer])
             for T in poses_from_square(view.camera, template, candidate.corners_px, spec.side_m, spec.surface):

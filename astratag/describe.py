@@ -22,7 +22,7 @@ from astratag.cylinder import CylinderWarp
 from astratag.detection import Detection, LayerDetection, PlanarPose
 from astratag.dictionary import Dictionary, load_dictionary
 from astratag.edges import BORDER_UNITS
-from astratag.geometry import LAYERS, TEMPLATE_UNITS, layer_points, square
+from astratag.geometry import LAYERS, SQUARES, TEMPLATE_UNITS, layer_points, square
 from astratag.grow import Fit, settle
 from astratag.layers import measure_layers
 from astratag.matching import INDEPENDENT_CELLS, acceptance_of_pixels
@@ -34,7 +34,7 @@ from astratag.surface import Cylinder, Flat, Surface
 from astratag.synthesis import Alignment, Synthesis
 from astratag.transforms import difference
 from astratag.view import View
-from astratag.warp import OUTSIDE_PX, FittedWarp, HomographyWarp, PoseWarp
+from astratag.warp import OUTSIDE_PX, FittedWarp, HomographyWarp, PoseWarp, sides_of
 
 Array = NDArray[np.float64]
 
@@ -52,10 +52,8 @@ POLISHED_TO_PX = 0.08
 """The step after one that moved a print by less would move it by a hundredth of a pixel."""
 POLISHED_PX, LEAST_POLISHED = 90.0, 0.95
 """Markers that look smaller than this are measured by all their pixels, not by their edges, where these look right."""
-SQUARES = np.array([square(*layer.black) for layer in LAYERS])
-"""The black squares' corners (3, 4, 2), template units."""
-SQUARES.flags.writeable = False
 CELLS_WITHIN = np.array([layer_points(square(BORDER_UNITS, TEMPLATE_UNITS - BORDER_UNITS), layer) for layer in LAYERS])
+CELLS_WITHIN.flags.writeable = False
 """The corners (3, 4, 2) of the squares that hold the layers' cells, template units."""
 
 
@@ -194,10 +192,9 @@ class Describer:
 
     def polished(self, view: View, detection: Detection, below_px: float = POLISHED_PX) -> Detection:
         """Return a detection measured again by all its pixels when it looks small: from each pose its corners allow."""
-        sides_px = np.linalg.norm(np.roll(detection.corners_px, -1, axis=0) - detection.corners_px, axis=1)
         if detection.method in ("tps", "cylinder") and self.spec(detection.marker_id).surface is None:
             return detection
-        if sides_px.sum() / 4 >= below_px:
+        if sides_of(detection.corners_px)[0] >= below_px:
             return detection
         spec = self.spec(detection.marker_id)
         starts: list[FittedWarp] = [HomographyWarp.from_points(OUTER, detection.corners_px)]
@@ -287,7 +284,7 @@ def _listed(markers: Mapping[int, MarkerSpec] | None, dictionary: Dictionary) ->
 
 def inside(corners_px: Array, shape: tuple[int, ...]) -> bool:
     """Return whether all corners (4, 2) are inside an image of a shape."""
-    return bool((corners_px >= 0).all() and (corners_px <= (shape[1] - 1, shape[0] - 1)).all())
+    return all(0 <= x <= shape[1] - 1 and 0 <= y <= shape[0] - 1 for x, y in corners_px.tolist())
 
 
 def lead(scores: Array, layer: int) -> float:

@@ -220,6 +220,10 @@ LAYERS = (
     Layer(2, (288.0, 412.0), (277.0, 423.0), origin=287.0, scale=125.0 / 700.0, frame_corner_radius=5.0),
 )
 """The published layers, measured on the artwork."""
+SQUARES = tuple(square(*layer.black) for layer in LAYERS)
+"""The corners (4, 2) of each layer's black square, not to be changed: warps keep where they are on a surface."""
+for _corners in SQUARES:
+    _corners.flags.writeable = False
 
 
 TURN_CLOCKWISE = np.array(

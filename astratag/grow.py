@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from astratag.edges import EDGE_LAYER, EDGES
 from astratag.fit import EdgeFit, fit_edges
-from astratag.geometry import LAYERS, square
+from astratag.geometry import SQUARES
 from astratag.neighbours import Crossings
-from astratag.warp import BentWarp, FittedWarp, HomographyWarp
+from astratag.warp import BentWarp, FittedWarp, HomographyWarp, sides_of
 
 Light = NDArray[np.float32]
 Fit = EdgeFit[FittedWarp]
@@ -28,8 +28,7 @@ SURELY_FLAT = 0.02
 
 def layer_side_px(warp: FittedWarp, layer: int) -> float:
     """Return the mean length of a layer's sides in the image."""
-    corners = warp(square(*LAYERS[layer].black))
-    return float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).mean())
+    return sides_of(warp(SQUARES[layer]))[0]
 
 
 def fit_own_edges(light: Light, warp: FittedWarp, layer: int) -> Fit | None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from astratag.camera import Camera, pixel
 from astratag.compiled import CUBE, MATRIX, REAL, VECTOR, compiled
 from astratag.detection import LayerDetection, PlanarPose
-from astratag.geometry import LAYERS, square
+from astratag.geometry import SQUARES
 from astratag.normal import dot, factored, inverse
 from astratag.surface import Surface
 from astratag.transforms import perturbed, pose
@@ -21,7 +21,6 @@ from astratag.warp import PoseWarp, on_surface, pose_jacobian, seen_from
 
 Array = NDArray[np.float64]
 
-_SQUARES = [square(*layer.black) for layer in LAYERS]
 REFINEMENT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 6, 1e-8)
 MAX_STEPS = 30
 NEAREST_M = 1e-6
@@ -93,7 +92,7 @@ def planar_poses(
     corners_px = np.concatenate([seen.corners_px for seen in layers])
     if known is None:
         largest = min(layers, key=lambda seen: seen.layer)
-        starts = poses_from_square(camera, _SQUARES[largest.layer], largest.corners_px, side_m, surface)
+        starts = poses_from_square(camera, SQUARES[largest.layer], largest.corners_px, side_m, surface)
     else:
         starts = [known, mirrored(known)]
     if not starts:
@@ -135,7 +134,7 @@ def mirrored(T_cam_marker: Array) -> Array:
 @lru_cache(maxsize=8)
 def template_of_layers(layers: tuple[int, ...]) -> Array:
     """Return the corners (4 L, 2) of layers' black squares, template units, not to be changed."""
-    corners = np.concatenate([_SQUARES[layer] for layer in layers])
+    corners = np.concatenate([SQUARES[layer] for layer in layers])
     corners.flags.writeable = False
     return corners
 

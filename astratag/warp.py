@@ -240,6 +240,17 @@ class PoseWarp:
 
 
 @compiled(MATRIX)
+def sides_of(corners: Array) -> tuple[float, float]:
+    """Return the mean and the largest length of the sides of a quad (4, 2)."""
+    total, longest = 0.0, 0.0
+    for i in range(4):
+        dx, dy = corners[i, 0] - corners[i - 1, 0], corners[i, 1] - corners[i - 1, 1]
+        length = np.sqrt(dx * dx + dy * dy)
+        total, longest = total + length, max(longest, length)
+    return total / 4, longest
+
+
+@compiled(MATRIX)
 def plane_of(quad: Array) -> Array:
     """Return the homography (3, 3) that takes the unit square, clockwise from the origin, to a quad (4, 2).
 
