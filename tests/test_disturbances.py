@@ -226,7 +226,7 @@ def test_a_map_that_contradicts_the_images(seed):
             message = message.model_copy(update={"detections": [seen, seen.model_copy(update={"marker_id": 7})]})
         found.append(next(iter(pose_filter.step(message))))
     refused = [reason for state in found[6:] for reason in state.rejections]
-    assert refused and all(reason.startswith("gate: marker 7") for reason in refused)
+    assert refused and all(reason.startswith("map: marker 7") for reason in refused)
     assert all(state.mode == Mode.TRACK and 7 not in state.marker_ids for state in found)
     assert_honest(found, seed)
 
