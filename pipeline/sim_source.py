@@ -81,15 +81,16 @@ class SimSource(Source):
                 self.skipped += 1
                 continue
             time.sleep(max(wait_ns, 0) / NS_PER_S)
-            yield from self._frame(camera, sequence, (t_ns - start_ns) / NS_PER_S, t_ns)
+            yield from self._frame(camera, sequence, t_ns - start_ns, t_ns)
 
-    def _frame(self, camera: SimCamera, sequence: int, t_s: float, t_ns: int) -> Iterator[Envelope]:
-        mission = self.mission
+    def _frame(self, camera: SimCamera, sequence: int, since_start_ns: int, t_ns: int) -> Iterator[Envelope]:
+        """Yield the truth and the frame of an instant: a scenario's pictures are the same whenever it is run."""
+        mission, t_s = self.mission, since_start_ns / NS_PER_S
         motion, T_target_marker = self._scenario.approach.at(t_s), mission.markers[0].T_target_marker.matrix()
         T_chaser_cam = mission.camera.T_chaser_cam.matrix()
         truth = truth_message(motion, T_chaser_cam=T_chaser_cam, T_target_marker=T_target_marker, t_capture_ns=t_ns)
         yield self._wrap(truth, Stamp(sequence, t_ns, 0))
-        data = camera.jpeg(motion.T_a_b @ inverse(T_target_marker), t_ns)
+        data = camera.jpeg(motion.T_a_b @ inverse(T_target_marker), since_start_ns)
         image = CompressedImage(frame_id=mission.camera.name, data=data, format="jpeg")
         image.timestamp.FromNanoseconds(t_ns)
         yield self._wrap(image, Stamp(sequence, t_ns, 0))
