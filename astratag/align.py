@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from astratag.compiled import CUBE, GRAY, MATRIX, REAL, VECTOR, compiled
 from astratag.geometry import TEMPLATE_UNITS, square
-from astratag.normal import dot, factored, gram, solved
+from astratag.normal import dot, factored, gram, ranked, solved
 from astratag.sampling import between
 from astratag.warp import FittedWarp
 
@@ -58,16 +58,6 @@ def align(gray: Image, warp: W, points: Array, expected: Array, *, blur: float, 
             return warp
         warp = warp.stepped(_solve(columns, value, warp.step_sigma()))
     return warp
-
-
-def _solve(columns: Array, value: Array, step_sigma: Array) -> Array:
-    """Return the step (P,) that is the first unknowns of columns (P + 9, N), twice reweighted against outliers."""
-    weight, sigma = np.ones(len(value)), FIRST_SIGMA
-    for _ in range(2):
-        x, residual = _solution(columns, value, weight, step_sigma, sigma)
-        sigma = 1.4826 * float(np.median(np.abs(residual))) + 1e-3
-        weight = np.clip(1 - (residual / (TUKEY * sigma)) ** 2, 0, None) ** 2
-    return x[: len(step_sigma)]
 
 
 @compiled(GRAY, MATRIX, CUBE, MATRIX)
@@ -120,3 +110,15 @@ def _solution(columns: Array, value: Array, weight: Array, step_sigma: Array, si
     for i in range(size):
         residual -= x[i] * columns[i]
     return x, residual
+
+
+@compiled(MATRIX, VECTOR, VECTOR)
+def _solve(columns: Array, value: Array, step_sigma: Array) -> Array:
+    """Return the step (P,) that is the first unknowns of columns (P + 9, N), twice reweighted against outliers."""
+    weight, sigma = np.ones(len(value)), FIRST_SIGMA
+    for _ in range(2):
+        x, residual = _solution(columns, value, weight, step_sigma, sigma)
+        sigma = 1.4826 * ranked(np.abs(residual), len(residual) // 2) + 1e-3
+        for n in range(len(weight)):
+            weight[n] = max(1 - (residual[n] / (TUKEY * sigma)) ** 2, 0.0) ** 2
+    return x[: len(step_sigma)].copy()

@@ -41,7 +41,7 @@ MAX_RELIT, MAX_RELIT_READ = 4, 40
 LEAST_RELIT_SIDE_PX = 32.0
 """Of squares smaller than this the margin and the gaps between cells are too thin to tell how they are lit."""
 MAX_BENT = 3
-MAX_BENT_READ = 8
+MAX_BENT_READ = 4
 LEAST_BENT_SIDE_PX = 16.0
 LEAST_FRAMED, LEAST_FRAMED_RELIT = 3, 2
 LEAST_STEP_GREY = 4.0

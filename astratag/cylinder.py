@@ -7,14 +7,15 @@ seen whole, that side and the angle the print is turned by fix one.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.camera import Camera, pixel_slope
-from astratag.compiled import MATRIX, REAL, VECTOR, compiled
+from astratag.camera import Camera, pixel, pixel_slope
+from astratag.compiled import CUBE, INT, MATRIX, REAL, VECTOR, array, compiled
 from astratag.geometry import TEMPLATE_UNITS, print_from_template, square
 from astratag.surface import Cylinder
 from astratag.transforms import pose
@@ -28,6 +29,8 @@ LEAST_CURVATURE, MOST_CURVATURE = 0.02, 2.4
 """Sides per radius: a bend that nothing would show, and a print that spans 138 degrees."""
 CURVATURE_STEP, AXIS_STEP_RAD = 0.3, 0.3
 """How far one step may take them, as standard deviations: edges seen square-on say little of either."""
+NEAREST = 1e-3
+"""How near the camera, in sides, a point is taken to be that is nearer, or behind it."""
 HALF_ANGLES_RAD = (0.12, 0.3, 0.6)
 """How far a square may bend to either side of its middle: layers of radii 0.8 to 2 sides are near one of these."""
 TURNS_RAD = (1.13, 1.22, 1.31, 1.4)
@@ -168,29 +171,67 @@ class Bent:
 
     def project(self, template: Array, which: NDArray[np.int64] | None = None) -> Array:
         """Return where template points (S, 2) lie in the image (N, S, 2) for those ``which`` (N, 2), or for ``all``."""
-        on_print = print_from_template(template, 1.0)
-        points = np.stack([surface.points(on_print) for surface in self._surfaces]).swapaxes(1, 2)  # (M, 3, S)
-        if which is None:
-            points_cam = (self.rotation @ points + self.translation[..., None]).reshape(-1, 3, len(template))
-        else:
-            place, model = which.T
-            points_cam = self.rotation[place, model] @ points[model] + self.translation[place, model, :, None]
-        points_cam[:, 2] = np.maximum(points_cam[:, 2], 1e-3)
-        return self.camera.project(points_cam.swapaxes(1, 2).reshape(-1, 3)).reshape(-1, len(template), 2)
+        return self._seen(template, which)[0]
 
     def facing(self, template: Array, which: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which template points (N, S) face the viewer by more than a grazing angle."""
-        on_print = print_from_template(template, 1.0)
-        points = np.stack([surface.points(on_print) for surface in self._surfaces])
-        normals = np.stack([surface.normals(on_print) for surface in self._surfaces])
-        place, model = which.T
-        eye = -self.translation[place, model, None] @ self.rotation[place, model]  # where the print sees the camera
-        towards, normals = eye - points[model], normals[model]
-        return (towards * normals).sum(axis=2) > GRAZING_COSINE * np.sqrt((towards * towards).sum(axis=2))
+        return self._seen(template, which)[1]
 
-    @property
-    def _surfaces(self) -> list[Cylinder]:
-        return [Cylinder(1 / k, axis) for k, axis in zip(self.curvature, self.axis_rad, strict=True)]
+    def _seen(self, template: Array, which: NDArray[np.int64] | None) -> tuple[Array, NDArray[np.bool_]]:
+        return _project_bent(
+            print_from_template(template, 1.0),
+            self.curvature,
+            self.axis_rad,
+            np.ascontiguousarray(self.rotation),
+            np.ascontiguousarray(self.translation),
+            np.ascontiguousarray(self.all if which is None else which),
+            self.camera.lens,
+        )
+
+
+@compiled(MATRIX, VECTOR, VECTOR, array(REAL, 4), CUBE, array(INT, 2), VECTOR)
+def _project_bent(
+    on_print: Array,
+    curvature: Array,
+    axis_rad: Array,
+    rotation: Array,
+    translation: Array,
+    which: NDArray[np.int64],
+    lens: Array,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return where print points (S, 2) are seen (N, S, 2), and which face the viewer (N, S).
+
+    Of the squares ``which`` (N, 2), place and model, of those that ``Bent`` describes.
+    """
+    count = len(on_print)
+    points, normals = np.empty((len(curvature), count, 3)), np.empty((len(curvature), count, 3))
+    for m in range(len(curvature)):
+        c, s, radius = math.cos(axis_rad[m]), math.sin(axis_rad[m]), 1 / curvature[m]
+        for i in range(count):
+            x, y = on_print[i]
+            along, angle = c * x + s * y, (c * y - s * x) / radius
+            sine, cosine = math.sin(angle), math.cos(angle)
+            points[m, i, 0] = c * along - s * radius * sine
+            points[m, i, 1] = s * along + c * radius * sine
+            points[m, i, 2] = radius * (cosine - 1)
+            normals[m, i, 0], normals[m, i, 1], normals[m, i, 2] = -s * sine, c * sine, cosine
+    at, facing = np.empty((len(which), count, 2)), np.empty((len(which), count), dtype=np.bool_)
+    for n in range(len(which)):
+        q, m = which[n]
+        R, t = rotation[q, m], translation[q, m]
+        for i in range(count):
+            X, N = points[m, i], normals[m, i]
+            x = R[0, 0] * X[0] + R[0, 1] * X[1] + R[0, 2] * X[2] + t[0]
+            y = R[1, 0] * X[0] + R[1, 1] * X[1] + R[1, 2] * X[2] + t[1]
+            z = R[2, 0] * X[0] + R[2, 1] * X[1] + R[2, 2] * X[2] + t[2]
+            towards = -(
+                x * (R[0, 0] * N[0] + R[0, 1] * N[1] + R[0, 2] * N[2])
+                + y * (R[1, 0] * N[0] + R[1, 1] * N[1] + R[1, 2] * N[2])
+                + z * (R[2, 0] * N[0] + R[2, 1] * N[1] + R[2, 2] * N[2])
+            )
+            facing[n, i] = towards > GRAZING_COSINE * math.sqrt(x * x + y * y + z * z)
+            at[n, i, 0], at[n, i, 1] = pixel(x, y, max(z, NEAREST), lens)
+    return at, facing
 
 
 def bent_through(camera: Camera, quads: Array, half_angles_rad: tuple[float, ...] = HALF_ANGLES_RAD) -> Bent:

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from astratag.camera import Camera
 from astratag.candidates import (
+    MAX_BENT_READ,
+    MAX_RELIT_READ,
     SURE,
     Candidate,
     bent_candidates,
@@ -34,13 +36,15 @@ from astratag.describe import PIXEL_BLUR, MarkerSpec
 from astratag.detection import Detection
 from astratag.dictionary import Dictionary
 from astratag.edges import Transfer, inverse_transfer
-from astratag.effort import first_distinct
+from astratag.effort import COST, Effort, first_distinct
 from astratag.matching import rough_matches
 from astratag.search import (
     BROAD,
     COARSE,
     FAINT,
+    FINE_PX,
     NARROW,
+    NONE,
     PLAIN,
     SLANTED,
     STEEP,
@@ -71,6 +75,12 @@ COVER_REACH_PX = 30_000
 """OpenCV draws no further."""
 MAX_READ_BY_PIXELS, MAX_MATCHED = 12, 5
 """Squares in one image that are read by all their pixels; and that are aligned with a print."""
+LEAST_CLOSE_PX = 16.0
+"""Flat squares smaller than this are left to their pixels.
+
+Of 300 markers found by their edges or an alignment the smallest square was 19 pixels wide; what chance makes read like
+a code is mostly smaller.
+"""
 MAX_ALIGNED_AT_ONCE = 4
 """Candidates that are moved until they look as they read, of those found by one way of telling ink from paper."""
 
@@ -147,11 +157,12 @@ class Detector(Confirmer):
         listed are worth another look where nothing is found yet, and nothing else is taken from it.
         """
         found = list(found)
+        effort = Effort(view.gray.size)  # of its own: what was found at once took little, and is worth the rest
         for how in ways if found else ():
             missing = set(self.markers) - {seen.marker_id for seen in found}
             if not missing:
                 break
-            rest = replace(view, gray=_covered(view.gray, found), scaled={}, outlines={})
+            rest = replace(view, gray=_covered(view.gray, found), effort=effort, scaled={}, outlines={})
             outlines = _outlines(rest, how)
             others = [*self.search(rest, outlines), *self._search_bent(rest, outlines)]
             found = surest([seen for seen in others if seen.marker_id in missing], first=found)
@@ -175,7 +186,7 @@ class Detector(Confirmer):
         for (left, top), (right, bottom) in [whole] if boxes is None else boxes:
             part = slice(int(top), int(bottom)), slice(int(left), int(right))
             cv2.LUT(gray[part], self._light_of, dst=self._light[part])
-        return View(gray, self._light, camera)
+        return View(gray, self._light, camera, Effort(gray.size))
 
     def search(self, view: View, outlines: Outlines, *, whole: bool = False) -> list[Detection]:
         """Return the markers among outlines read as if flat, each once, the surest first; see ``quads_of``."""
@@ -184,7 +195,9 @@ class Detector(Confirmer):
 
     def _search_relit(self, view: View, quads: Array) -> list[Detection]:
         """Return the markers among quads (Q, 4, 2) in glare, hard shadow or half covered."""
-        if self._codebook.tau_hamming is not None:
+        if self._codebook.tau_hamming is not None or not view.effort.spend(
+            COST.relit * min(len(quads), MAX_RELIT_READ)
+        ):
             return []
         return surest(self._confirm_all(view, relit_candidates(view.gray, view.light, quads, self._codebook)))
 
@@ -212,12 +225,16 @@ class Detector(Confirmer):
         """Return the markers on surfaces that no cylinder explains."""
         if not self._bends:
             return []
+        if not view.effort.spend(COST.spline * MAX_BENT_READ):
+            return []
         bent = bent_quads_of(_outlines(view, PLAIN))
         return surest(self._confirm_all(view, bent_candidates(view.gray, bent, self._codebook)))
 
     def _search_curved(self, view: View, bent: Bent) -> list[Detection]:
         """Return the markers among squares bent about cylinders."""
-        return surest(self._confirm_all(view, curved_candidates(view.gray, bent, self._codebook)))
+        if not view.effort.spend(COST.bent * bent.translation[..., 0].size + COST.bent_read):
+            return []
+        return surest(self._confirm_all(view, curved_candidates(view.gray, bent, self._codebook, self._artwork)))
 
     def _search_pixels(self, view: View) -> list[Detection]:
         """Return the markers whose edges or cells cannot be followed, by all their pixels; see ``matching``.
@@ -231,8 +248,10 @@ class Detector(Confirmer):
             if found:
                 return found
             fresh = first_distinct(framed(view.gray, quads), tried, MAX_READ_BY_PIXELS - len(tried))
+            fresh = fresh[: view.effort.afford(COST.by_pixels, len(fresh))]
             tried = np.concatenate([tried, fresh])
             rough = rough_matches(self._synthesis, view.light, fresh, PIXEL_BLUR)[:left]
+            rough = rough[: view.effort.afford(COST.matched, len(rough))]
             left -= len(rough)
             found = [seen for seen in (self._confirm_pixels(view, one) for one in rough) if seen is not None]
             if found:
@@ -262,22 +281,34 @@ class Detector(Confirmer):
             weak = candidate.reading.correlation < LIKELY and _sure(found)
             if weak or _inside_any(candidate.corners_px, found):
                 continue
-            by_edges = not candidate.bent and view.by_edges.take(candidate)
+            if candidate.side_px < LEAST_CLOSE_PX:
+                continue
+            by_edges = not candidate.bent and view.by_edges.take(candidate) and view.effort.spend(COST.edges)
             if not (by_edges and take(candidate, self._confirm_edges(view, candidate))):
                 left.append(candidate)
         for candidate in [] if _sure(found) or quick else left[:MAX_ALIGNED_AT_ONCE]:
-            tries = view.curved if isinstance(candidate.warp, CylinderWarp) else view.aligned
-            if not _inside_any(candidate.corners_px, found) and tries.take(candidate):
+            curved = isinstance(candidate.warp, CylinderWarp)
+            tries, units = (view.curved, COST.curved) if curved else (view.aligned, COST.aligned)
+            if _inside_any(candidate.corners_px, found):
+                continue
+            if tries.take(candidate) and view.effort.spend(units):
                 take(candidate, self._confirm_aligned(view, candidate))
         return found + [seen for seen in surest(unmeasured) if not _inside_any(seen.corners_px, found)]
 
 
 def _outlines(view: View, how: Binarisation) -> Outlines:
-    """Return the outlines in an image, found once each way."""
-    if how not in view.outlines:
-        if how.scale not in view.scaled:
-            view.scaled[how.scale] = scaled(view.gray, how.scale)
-        view.outlines[how] = find_outlines(view.gray, how, view.scaled[how.scale])
+    """Return the outlines in an image, found once each way; none when it was looked at enough."""
+    if how in view.outlines:
+        return view.outlines[how]
+    enlarged = how.scale**2 * view.gray.size
+    looked_at = min(enlarged, how.scale**2 * FINE_PX) if how.scale > 1 else enlarged
+    if not view.effort.spend(COST.pixel * looked_at + COST.resized_pixel * enlarged):
+        return NONE
+    if how.scale not in view.scaled:
+        view.scaled[how.scale] = scaled(view.gray, how.scale)
+    found = find_outlines(view.gray, how, view.scaled[how.scale])
+    points = COST.contour_point * sum(map(len, found.others))
+    view.outlines[how] = found if view.effort.spend(points + COST.outline * len(found.contours)) else NONE
     return view.outlines[how]
 
 

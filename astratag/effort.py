@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,6 +13,63 @@ Array = NDArray[np.float64]
 
 SAME_SQUARE = 0.04
 """Squares whose centres and sides differ by less than this fraction are one square found twice."""
+
+
+LEAST_UNITS, UNITS_A_PIXEL = 72_000, 0.012
+"""What one image is worth whatever its size, and more for each pixel: what the hardest markers of 12 pixels and at 83
+degrees of tilt take to be found among clutter.
+
+A unit is what takes about a microsecond, counted and never measured, so that the same image always gets the same.
+"""
+
+
+class Effort:
+    """How many units of effort an image is worth, and how many were spent on it."""
+
+    def __init__(self, pixels: int) -> None:
+        self.most = LEAST_UNITS + UNITS_A_PIXEL * pixels
+        self.spent = 0.0
+
+    def spend(self, units: float) -> bool:
+        """Return whether so many units are left, and spend them if so."""
+        if self.spent + units > self.most:
+            return False
+        self.spent += units
+        return True
+
+    def afford(self, units: float, most: int) -> int:
+        """Return how many things of so many units each can be done, ``most`` at most, and spend what they take."""
+        count = min(most, int((self.most - self.spent) / units))
+        self.spent += count * units
+        return count
+
+
+@dataclass(frozen=True)
+class Costs:
+    """What is done in an image, in units."""
+
+    pixel: float = 0.007
+    """Of a picture in which outlines are looked for."""
+    resized_pixel: float = 0.001
+    """More of the whole picture, at the resolution worked at."""
+    contour_point: float = 0.1
+    outline: float = 8.0
+    """Simplified, and read as if flat."""
+    edges: float = 400.0
+    aligned: float = 2500.0
+    bent: float = 2.0
+    """A bent square whose frame is looked at."""
+    bent_read: float = 2000.0
+    """Those that have one, and how the best look."""
+    curved: float = 4000.0
+    relit: float = 15.0
+    """An outline read cell by cell."""
+    by_pixels: float = 500.0
+    matched: float = 5000.0
+    spline: float = 600.0
+
+
+COST = Costs()
 
 
 class Tries:

@@ -8,12 +8,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import hypot
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from astratag.binarise import threshold_blocks
+from astratag.polygons import convex_quads
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -66,8 +68,6 @@ POLYGON_TOLERANCES = (0.03, 0.05, 0.015, 0.08)
 """Fractions of the perimeter, most useful first; skinny quads need the small ones, bent squares the large."""
 WHOLE_TOLERANCES = 2
 """How many of them a square needs that is whole, not very skinny, and not very bent."""
-TOLERANCES_A_SIDE = 5.0
-"""How many times the tolerance the shortest side must be, or corners are moved by too much of it."""
 BENT_TOLERANCE = 0.015
 MAX_VERTICES = 16
 LEAST_TURN = 0.2
@@ -84,6 +84,9 @@ Of its own pixels: enlarged twice, half as many change.
 """
 MAX_CONTOURS = 500
 MAX_BENT_OUTLINES = 120
+MAX_HULLS, MAX_CUT = 120, 12
+"""Outlines, the longest first, whose hulls are simplified; and whose corners beyond the image's border are looked for.
+"""
 OUTSET_PX, INSET_PX = 0.75, -0.5
 """Contours run through the centres of the outermost ink pixels, or of the white pixels beside a hole."""
 LEAST_SINE = 0.1
@@ -124,6 +127,9 @@ class Outlines:
         return _bent_quads(self)
 
 
+NONE = Outlines(contours=[], scale=1.0, origin=np.zeros(2), outset_px=0.0)
+
+
 class BentQuads(NamedTuple):
     """Shapes with four corners (B, 4, 2) and a bulge of each side (B, 4, 2): how far its middle lies off the chord."""
 
@@ -132,10 +138,11 @@ class BentQuads(NamedTuple):
 
 
 class Scaled(NamedTuple):
-    """An image at another resolution, and 255 where outlines are looked for in it; None is everywhere."""
+    """An image at another resolution, and which blocks (R, C) of it outlines are looked for in; None is everywhere."""
 
     gray: Image
-    worth: Image | None = None
+    worth: NDArray[np.bool_] | None = None
+    block_px: int = BLOCK_PX
 
 
 def scaled(gray: Image, scale: float) -> Scaled:
@@ -144,10 +151,7 @@ def scaled(gray: Image, scale: float) -> Scaled:
         return Scaled(gray)
     interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     other = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=interpolation)
-    worth = _worth_a_fine_look(gray) if scale > 1 else None
-    if worth is not None:
-        worth = cv2.resize(worth, other.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    return Scaled(other, worth)
+    return Scaled(other, _worth_a_fine_look(gray) if scale > 1 else None, round(BLOCK_PX * scale))
 
 
 def find_outlines(gray: Image, how: Binarisation = PLAIN, image: Scaled | None = None) -> Outlines:
@@ -155,14 +159,15 @@ def find_outlines(gray: Image, how: Binarisation = PLAIN, image: Scaled | None =
 
     ``image`` is what ``scaled`` makes of the gray one, if that is known.
     """
-    gray, worth = scaled(gray, how.scale) if image is None else image
+    gray, worth, block_px = scaled(gray, how.scale) if image is None else image
     smooth = cv2.blur(gray, (how.smooth_px,) * 2) if how.smooth_px > 1 else gray
-    kind, offset = (cv2.THRESH_BINARY, -how.offset) if how.holes else (cv2.THRESH_BINARY_INV, how.offset)
-    shapes = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, kind, how.window_px, offset)
-    looked_at = shapes.size
-    if worth is not None:
-        shapes &= worth
-        looked_at = cv2.countNonZero(worth)
+    if worth is None:
+        kind, offset = (cv2.THRESH_BINARY, -how.offset) if how.holes else (cv2.THRESH_BINARY_INV, how.offset)
+        shapes = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, kind, how.window_px, offset)
+        looked_at = shapes.size
+    else:
+        shapes = threshold_blocks(smooth, worth, block_px, how.window_px, how.offset, how.holes)
+        looked_at = int(worth.sum()) * block_px**2
     changes = cv2.countNonZero(cv2.absdiff(shapes[:, 1:], shapes[:, :-1]))
     noisy = how.scale * changes > NOISE * looked_at  # hundreds of thousands of contours, and none of them a square
     contours = () if noisy else cv2.findContours(shapes, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)[0]
@@ -178,8 +183,8 @@ def find_outlines(gray: Image, how: Binarisation = PLAIN, image: Scaled | None =
     )
 
 
-def _worth_a_fine_look(gray: Image) -> Image | None:
-    """Return 255 where an image (H, W) is worth enlarging, ``FINE_PX`` at most, and 0 elsewhere; None when all is."""
+def _worth_a_fine_look(gray: Image) -> NDArray[np.bool_] | None:
+    """Return which blocks (R, C) of an image (H, W) are worth enlarging, ``FINE_PX`` at most; None when all are."""
     if gray.size <= FINE_PX:
         return None
     rows, columns = (-(-extent // BLOCK_PX) for extent in gray.shape)
@@ -189,10 +194,9 @@ def _worth_a_fine_look(gray: Image) -> Image | None:
     )
     largest = step.reshape(rows, BLOCK_PX, columns, BLOCK_PX).max(axis=(1, 3))
     near = cv2.dilate(largest, np.ones((3, 3), np.uint8))
-    fine = np.zeros(near.size, np.uint8)
-    fine[np.argsort(-near.ravel().astype(int), kind="stable")[: FINE_PX // BLOCK_PX**2]] = 255
-    enlarged = cv2.resize(fine.reshape(rows, columns), None, fx=BLOCK_PX, fy=BLOCK_PX, interpolation=cv2.INTER_NEAREST)
-    return enlarged[: len(gray), : gray.shape[1]]
+    fine = np.zeros(near.size, dtype=bool)
+    fine[np.argsort(-near.ravel().astype(int), kind="stable")[: FINE_PX // BLOCK_PX**2]] = True
+    return fine.reshape(rows, columns)
 
 
 def find_quads(gray: Image, how: Binarisation = PLAIN) -> Array:
@@ -214,11 +218,16 @@ def bent_quads_of(outlines: Outlines) -> BentQuads:
 
 
 def _quads(outlines: Outlines, *, whole: bool) -> Array:
-    found: list[NDArray[np.generic] | None] = []
-    for cut, (perimeter, contour) in zip(_cut(outlines), outlines.contours, strict=True):
-        uncut = _uncut(contour, perimeter, outlines.size) if cut and not whole else None
-        found.append(_simplified(contour, perimeter, whole) if uncut is None else uncut)
-    quads = np.array([polygon for polygon in found if polygon is not None], dtype=float).reshape(-1, 4, 2)
+    contours = [contour for _, contour in outlines.contours]
+    if not contours:
+        return np.zeros((0, 4, 2))
+    perimeters = np.array([perimeter for perimeter, _ in outlines.contours])
+    found, quads = _simplified_to_quads(contours, perimeters, whole)
+    for i in np.flatnonzero(_cut(outlines))[:MAX_CUT].tolist() if not whole else ():
+        uncut = _uncut(contours[i], perimeters[i], outlines.size)
+        if uncut is not None:
+            found[i], quads[i] = True, uncut[:, 0]
+    quads = quads[found]
     turned = _cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1]) < 0
     quads[turned] = quads[turned, ::-1]
     quads = quads[_squared(quads[:, [1, 2, 3, 0]] - quads).min(axis=1) >= MIN_SIDE_PX**2]
@@ -291,30 +300,32 @@ def _grown(quads: Array, outset_px: float) -> Array:
     return quads + outset_px * (before - along) / np.maximum(_cross(before, along), LEAST_SINE)[..., None]
 
 
-def _simplified(contour: Contour, perimeter: float, whole: bool) -> Contour | None:
-    """Return the convex quad (4, 1, 2) that a contour simplifies to at the first tolerance that its sides bear.
+def _simplified_to_quads(
+    contours: Sequence[Contour], perimeters: Array, whole: bool
+) -> tuple[NDArray[np.bool_], Array]:
+    """Return which contours simplify to a convex quad (N,), and these quads (N, 4, 2).
 
-    One not much smaller than a skinny quad's short sides moves its corners along the long ones.  Else the quad of the
-    finest tolerance that gives one, else its hull's, unless only a ``whole`` square will do.
+    Else those of their hulls, unless only a ``whole`` square will do.
     """
-    finest, quad = np.inf, None
-    for tolerance in POLYGON_TOLERANCES[: WHOLE_TOLERANCES if whole else None]:
-        polygon = cv2.approxPolyDP(contour, tolerance * perimeter, True)
-        if len(polygon) == 4 and cv2.isContourConvex(polygon):
-            if whole or _shortest(polygon) >= TOLERANCES_A_SIDE * tolerance * perimeter:
-                return polygon
-            finest, quad = min((finest, quad), (tolerance, polygon), key=lambda found: found[0])
-    if quad is None and not whole:
-        hull = cv2.convexHull(contour)
-        if 4 <= len(hull) < len(contour):
-            return _simplified(hull, cv2.arcLength(hull, True), False)
-    return quad
+    found, quads = convex_quads(*_joined(contours), perimeters, _tolerances(whole), whole)
+    if whole:
+        return found, quads
+    hulls = {i: cv2.convexHull(contours[i]) for i in np.flatnonzero(~found)[:MAX_HULLS].tolist()}
+    rest = [i for i, hull in hulls.items() if 4 <= len(hull) < len(contours[i])]
+    if rest:
+        around = [hulls[i] for i in rest]
+        lengths = np.array([cv2.arcLength(hull, True) for hull in around])
+        found[rest], quads[rest] = convex_quads(*_joined(around), lengths, _tolerances(False), False)
+    return found, quads
 
 
-def _shortest(polygon: Contour) -> float:
-    """Return how long the shortest side of a quad (4, 1, 2) is."""
-    (ax, ay), (bx, by), (cx, cy), (dx, dy) = polygon[:, 0].tolist()
-    return min(hypot(bx - ax, by - ay), hypot(cx - bx, cy - by), hypot(dx - cx, dy - cy), hypot(ax - dx, ay - dy))
+def _tolerances(whole: bool) -> Array:
+    return np.array(POLYGON_TOLERANCES[: WHOLE_TOLERANCES if whole else None])
+
+
+def _joined(contours: Sequence[Contour]) -> tuple[Array, NDArray[np.int64]]:
+    """Return the points (P, 2) of contours one after another, and where each begins, and the last ends (N + 1,)."""
+    return np.concatenate(contours)[:, 0].astype(float), np.append(starts_of(contours), sum(map(len, contours)))
 
 
 def _cut(outlines: Outlines) -> NDArray[np.bool_]:

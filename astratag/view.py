@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from astratag.camera import Camera
 from astratag.checks import picture
 from astratag.cylinder import assumed_camera
-from astratag.effort import Tries
+from astratag.effort import Effort, Tries
 from astratag.search import Binarisation, Outlines, Scaled
 
 Array = NDArray[np.float64]
 
-MAX_BY_EDGES, MAX_ALIGNED, MAX_CURVED = 12, 8, 12
+MAX_BY_EDGES, MAX_ALIGNED, MAX_CURVED = 12, 5, 6
 """Candidates in one image whose edges are fitted; that are moved until they look as they read; and so on cylinders."""
 
 
@@ -24,13 +24,15 @@ MAX_BY_EDGES, MAX_ALIGNED, MAX_CURVED = 12, 8, 12
 class View:
     """One image as the detector works on it: gray, in linear light, and with its camera.
 
-    ``by_edges``, ``aligned`` and ``curved`` hold what was looked at closely in it, and end that when it was enough;
-    ``scaled`` holds it at the resolutions it was searched at, ``outlines`` what was found, one way and another.
+    ``effort`` is what all that is done in it is taken from; ``by_edges``, ``aligned`` and ``curved`` hold what was
+    looked at closely, and end that when it was enough; ``scaled`` holds it at the resolutions it was searched at,
+    ``outlines`` what was found, one way and another.
     """
 
     gray: NDArray[np.uint8]
     light: NDArray[np.float32]
     camera: Camera | None
+    effort: Effort
     by_edges: Tries = field(default_factory=lambda: Tries(MAX_BY_EDGES))
     aligned: Tries = field(default_factory=lambda: Tries(MAX_ALIGNED))
     curved: Tries = field(default_factory=lambda: Tries(MAX_CURVED))

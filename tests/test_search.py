@@ -13,12 +13,14 @@ import pytest
 import astratag.confirm
 import astratag.detector
 from astratag import Camera, Detector, Flat, load_dictionary
+from astratag.binarise import threshold_blocks
 from astratag.candidates import Candidate
 from astratag.codes import Reading
 from astratag.describe import outer_corners
 from astratag.detector import MAX_MATCHED
-from astratag.effort import Tries, first_distinct
+from astratag.effort import Effort, Tries, first_distinct
 from astratag.geometry import LAYERS, TEMPLATE_UNITS, square
+from astratag.polygons import simplified
 from astratag.search import (
     BLOCK_PX,
     BROAD,
@@ -28,6 +30,7 @@ from astratag.search import (
     MAX_CONTOURS,
     NARROW,
     PLAIN,
+    POLYGON_TOLERANCES,
     SLANTED,
     STEEP,
     THIN,
@@ -38,7 +41,7 @@ from astratag.search import (
     scaled,
 )
 from astratag.transforms import exp_so3, pose
-from astratag.view import MAX_ALIGNED, MAX_BY_EDGES
+from astratag.view import MAX_ALIGNED, MAX_BY_EDGES, MAX_CURVED
 from astratag.warp import HomographyWarp, PoseWarp
 from pipeline.render import render_marker
 
@@ -110,10 +113,37 @@ def test_only_the_largest_steps_are_worth_a_fine_look():
     image = np.full((720, 1280), 120, np.uint8)
     image[::32, ::32] = 150
     image[300:314, 700:714] = 10
-    worth = scaled(image, 2.0).worth
-    assert worth is not None and worth.shape == (1440, 2560)
-    assert cv2.countNonZero(worth) <= 4 * FINE_PX
-    assert worth[600 - BLOCK_PX : 628 + BLOCK_PX, 1400 - BLOCK_PX : 1428 + BLOCK_PX].all()
+    enlarged = scaled(image, 2.0)
+    assert enlarged.gray.shape == (1440, 2560) and enlarged.block_px == 2 * BLOCK_PX
+    assert enlarged.worth is not None and enlarged.worth.shape == (45, 80)
+    assert enlarged.worth.sum() * BLOCK_PX**2 <= FINE_PX
+    assert enlarged.worth[300 // BLOCK_PX : 314 // BLOCK_PX + 1, 700 // BLOCK_PX : 714 // BLOCK_PX + 1].all()
+
+
+@pytest.mark.parametrize("holes", [True, False])
+@pytest.mark.parametrize("how", [TINY, SLANTED, STEEP, THIN], ids=["tiny", "slanted", "steep", "thin"])
+def test_blocks_are_told_apart_as_by_opencv(how, holes):
+    rng = np.random.default_rng(0)
+    gray = cv2.resize(rng.integers(0, 256, (60, 83), dtype=np.uint8), (333, 250), interpolation=cv2.INTER_CUBIC)
+    worth = rng.random((8, 11)) < 0.5
+    kind, offset = (cv2.THRESH_BINARY, -how.offset) if holes else (cv2.THRESH_BINARY_INV, how.offset)
+    whole = cv2.adaptiveThreshold(gray, 255, cv2.ADAPTIVE_THRESH_MEAN_C, kind, how.window_px, offset)
+    inside = np.kron(worth, np.ones((32, 32), dtype=bool))[: len(gray), : gray.shape[1]]
+    shapes = threshold_blocks(gray, worth, 32, how.window_px, how.offset, holes)
+    np.testing.assert_array_equal(shapes, np.where(inside, whole, 0))
+
+
+def test_contours_simplify_as_by_opencv():
+    """All but a few, where two points are as far away and one or the other is kept."""
+    outlines = find_outlines(adversarial("blobs")).contours
+    alike = [
+        np.array_equal(
+            simplified(contour[:, 0].astype(float), t * length), cv2.approxPolyDP(contour, t * length, True)[:, 0]
+        )
+        for length, contour in outlines
+        for t in POLYGON_TOLERANCES
+    ]
+    assert len(alike) > 100 and np.mean(alike) > 0.99
 
 
 def test_bulges_against_the_parabolas_drawn():
@@ -201,9 +231,40 @@ def test_no_image_is_looked_at_closely_more_often_than_bounded(kind, surface, mo
         adversarial(kind), Camera([[300, 0, 160], [0, 300, 120], [0, 0, 1]], width=WIDTH, height=HEIGHT)
     )
     assert detector.find(view) == []
+    assert view.effort.spent <= view.effort.most
     assert len(view.by_edges.made) <= MAX_BY_EDGES and len(view.aligned.made) <= MAX_ALIGNED
+    assert len(view.curved.made) <= MAX_CURVED
     assert counts["match"] <= MAX_MATCHED and counts["find_outlines"] <= len(EVERY_BINARISATION)
     assert counts["grow"] <= len(LAYERS) * (MAX_BY_EDGES + MAX_ALIGNED)
+
+
+@pytest.mark.parametrize("kind", ["noise", "blobs", "board", "JPEG", "squares"])
+def test_what_is_done_ends_with_the_effort_an_image_is_worth(kind, monkeypatch):
+    """Whatever is left to do: costly calls are paid for, so that their number falls with the effort."""
+    detector = Detector()
+    camera = Camera([[300, 0, 160], [0, 300, 120], [0, 0, 1]], width=WIDTH, height=HEIGHT)
+    calls = []
+    for most in (0.0, 5_000.0, 20_000.0):
+        counts = dict.fromkeys(("find_outlines", "rough_matches", "curved_candidates"), 0)
+        with monkeypatch.context() as patch:
+            for name in counts:
+                patch.setattr(astratag.detector, name, counting(counts, name, astratag.detector))
+            view = detector.view(adversarial(kind), camera)
+            view.effort.most = most
+            assert detector.find(view) == []
+        assert view.effort.spent <= most
+        calls.append(counts)
+    assert calls[0]["find_outlines"] == calls[0]["curved_candidates"] == 0
+    assert calls[0]["find_outlines"] <= calls[1]["find_outlines"] <= calls[2]["find_outlines"]
+
+
+def test_effort_is_never_overspent():
+    effort = Effort(1000)
+    assert effort.spend(effort.most) and not effort.spend(1.0)
+    assert effort.afford(5.0, 3) == 0
+    effort = Effort(1000)
+    assert effort.afford(effort.most / 2.5, 7) == 2
+    assert effort.spent == pytest.approx(effort.most / 1.25)
 
 
 def test_noise_has_no_outlines_where_every_pixel_counts():
