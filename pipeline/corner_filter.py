@@ -8,7 +8,7 @@ in the marker's order.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -49,6 +49,8 @@ CONVERGED_SIGMAS = 1e-2
 """An iteration that moves no state by more than this share of its own uncertainty is the last."""
 LINEAR_SHARE = 0.02
 """Where curvature moves corners by less than this share of their noise, one iteration is enough."""
+LASTING_LOOKS = 20
+"""How many looks an error of the attitude lasts while it is large: 2 s of pictures, until others outweigh them."""
 START_RANGE_SHARE = 0.3
 START_ATTITUDE_RAD = 1.0
 """Uncertainty of the first guess of a pose before its corners are used: so wide that only they count."""
@@ -113,7 +115,16 @@ class Look:
         rows = np.concatenate([np.arange(CORNER_DOF * k, CORNER_DOF * (k + 1)) for k in chosen])
         layers = tuple(self.layers[k] for k in chosen)
         R, S = (whole[np.ix_(rows, rows)] for whole in (self.R, self.S))
-        return Look(self.motion, self.P, layers, self.residual_px[rows], self.H[rows], self.PHt[:, rows], R, S)
+        return Look(
+            self.motion,
+            self.P,
+            layers,
+            self.residual_px[rows],
+            self.H[rows],
+            np.ascontiguousarray(self.PHt[:, rows]),
+            R,
+            S,
+        )
 
 
 class CornerFilter:
@@ -188,7 +199,7 @@ class CornerFilter:
             variance = np.diag(self._P) - np.sum(K * look.PHt, axis=1)
             is_last = np.all(step**2 <= CONVERGED_SIGMAS**2 * np.abs(variance) + np.finfo(float).tiny)
             if is_last or _curvature_px(look, step, focal_px) < linear_px:
-                return self._accept(prior.moved(error), error, look, K, innovation, L)
+                return self._conclude(prior, error, look, K, innovation, L, eye)
             look = self._look_from(prior.moved(error), layers, eye, right_jacobian_so3(error[ATTITUDE]))
         return None
 
@@ -227,6 +238,23 @@ class CornerFilter:
         R[::2, ::2] += self.noise.picture_shift_px**2
         R[1::2, 1::2] += self.noise.picture_shift_px**2
         return R
+
+    def _conclude(
+        self, prior: Motion, error: Array, look: Look, K: Array, innovation: Array, L: Array, eye: Eye
+    ) -> Update | None:
+        """Accept an update, with less weight where the slopes do not hold as far as the pose is still uncertain."""
+        left = self._P[ATTITUDE, ATTITUDE] - K[ATTITUDE] @ look.PHt[ATTITUDE].T
+        bent = bending(look.motion, (left + left.T) / 2, look.layers, eye)
+        if bent is not None:
+            R, S = look.R + bent, look.S + bent
+            L, fault = dpotrf(S, lower=1)
+            if fault:
+                return None
+            look = replace(look, R=R, S=S)
+            K = dpotrs(L, look.PHt.T, lower=1)[0].T
+            K[self.considered] = 0.0
+            error = K @ innovation
+        return self._accept(prior.moved(error), error, look, K, innovation, L)
 
     def _accept(self, motion: Motion, error: Array, look: Look, K: Array, innovation: Array, L: Array) -> Update | None:
         """Put the error into the motion and express the covariance in the axes of the new attitude."""
@@ -302,6 +330,35 @@ def predicted_corners(motion: Motion, layers: Sequence[SeenLayer], eye: Eye) -> 
     if not (np.isfinite(pixels).all() and np.isfinite(H).all()):
         return None
     return pixels.ravel(), H.reshape(-1, STATES)
+
+
+def bending(motion: Motion, P_attitude: Array, layers: Sequence[SeenLayer], eye: Eye) -> Array | None:
+    """Return what slopes miss of corners (8 L, 8 L) px2 at attitudes as uncertain as this, None where that is little.
+
+    A nearly frontal print shows its tilt by squares of it: slopes depend on a tilt that is hardly known.  What they
+    miss stays the same while the error of the attitude does, and is no smaller after many looks: it counts for each.
+    Second moment of the second-order term, as in R. P. Wishner, J. A. Tabaczynski, M. Athans, "A comparison of three
+    non-linear filters", 1969.
+    """
+    points = np.concatenate([layer.points_target for layer in layers])
+    R_cam_chaser = eye.T_cam_chaser[:3, :3]
+    R_cam_target = R_cam_chaser @ motion.R_chaser_target
+    centre = points.mean(axis=0)
+    depth_m = (R_cam_target @ centre + R_cam_chaser @ motion.p_chaser_target_m + eye.T_cam_chaser[:3, 3])[2]
+    px_m, arms = eye.camera.K[0, 0] / float(depth_m), points - centre
+    sigma_px = min(layer.sigma_px for layer in layers)
+    most_px = px_m * float(np.abs(arms).max()) * float(np.trace(P_attitude))
+    if np.sqrt(LASTING_LOOKS) * most_px < LINEAR_SHARE * sigma_px:
+        return None
+    # second derivatives by w_i and w_j of component k of Exp(w) a, for every arm a_n, at w = 0
+    one = np.eye(3)
+    curved = (np.einsum("ik,nj->nkij", one, arms) + np.einsum("jk,ni->nkij", one, arms)) / 2
+    curved -= np.einsum("ij,nk->nkij", one, arms)
+    bent_px = px_m * np.einsum("rk,nkij->nrij", R_cam_target[:2], curved).reshape(-1, 3, 3)
+    mean_px = np.einsum("aij,ij->a", bent_px, P_attitude) / 2
+    spread_px = bent_px @ P_attitude
+    variance_px2 = np.einsum("aij,bji->ab", spread_px, spread_px) / 2
+    return np.asarray(LASTING_LOOKS * (variance_px2 + np.outer(mean_px, mean_px)))
 
 
 def _curvature_px(look: Look, step: Array, focal_px: float) -> float:

@@ -16,15 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astratag.transforms import inverse, skew
-from pipeline.corner_filter import CORNER_DOF, CornerFilter, Eye, SeenLayer, Update
-from pipeline.dynamics import ATTITUDE, POSITION, RATE, STATES, VELOCITY, OwnMotion
+from pipeline.corner_filter import CORNER_DOF, CornerFilter, Eye, SeenLayer, Update, predicted_corners
+from pipeline.dynamics import ATTITUDE, POSITION, RATE, STATES, VELOCITY, Motion, OwnMotion
 from pipeline.mission import FilterSection
 
 Array = NDArray[np.float64]
 
 POSE_DOF = 6
-LOOKS = 100
-"""How many of the last looks at the corners tell a pose from its mirror image."""
+LOOKS = np.array([100.0, 1.0])
+"""How many of the last looks at the corners tell a pose from its mirror image: many, where each says little, or one,
+where each says much and the tilt changes from one to the next."""
 FEWEST_LOOKS = 8.0
 SETTLED = 4.0
 """Evidence so many times what is asked for is looked at again only now and then."""
@@ -33,6 +34,8 @@ START_MISFIT = 25.0
 """A first pose whose squared residuals are this many times what their noise explains is not believed."""
 FIRST_LOOK = 4.0
 """How many times less certain a pose is begun with than its corners promise: a search is cruder than tracking."""
+LEAST_TILT = 0.1
+"""Sine of the least tilt at which looks are asked which way a print is tilted."""
 SAME_POSE = 0.02
 """Squared distance, as below, from which on two filters have come to the same and one is enough."""
 ONE_MODE = 2.0
@@ -55,10 +58,11 @@ class HypothesisBank:
         self.filters, self._log_weights, self._noise = filters, log_weights, noise
         self._T_target_marker, self._eye = T_target_marker, eye
         self._is_one_mode = False
-        self._against, self._looks = 0.0, 0.0
-        """Half of how much worse the likeliest pose's mirror image fits than itself, summed over the last looks."""
+        self._leaning, self._looks = np.zeros((2, 3)), np.zeros(2)
+        """Half of what the last looks say for a tilt rather than its reverse, for each unit of tilt, camera axes; and
+        how many they are."""
         self._evidence = 0.0
-        """The same as a logarithmic likelihood ratio."""
+        """What they say for the likeliest pose rather than its mirror image, as a logarithmic likelihood ratio."""
         self._enough = float(np.log(noise.ambiguity_ratio))
         self._unchecked = 0
         self._sort_and_prune()
@@ -92,7 +96,7 @@ class HypothesisBank:
         else:
             weights = [-best_misfit / scale / 2, -rival[0] / scale / 2]
             bank = cls([best, rival[1]], weights, noise, T_target_marker, eye)
-        bank._weigh_mirrored(bank._worse_mirrored(layers, eye) / scale, layers, eye)
+        bank._weigh_mirrored(bank._look_leans(layers, eye) / scale, layers, eye)
         for candidate in bank.filters:
             candidate.distrust_pose(FIRST_LOOK)
         return bank
@@ -116,7 +120,7 @@ class HypothesisBank:
 
         After a few looks at a distant print both may still be far from where they are going.
         """
-        return not (self._is_sure or (self._is_one_mode and self._looks > FEWEST_LOOKS))
+        return not (self._is_sure or (self._is_one_mode and self._looks[0] > FEWEST_LOOKS))
 
     @property
     def _is_sure(self) -> bool:
@@ -158,7 +162,7 @@ class HypothesisBank:
         """
         is_due = self._evidence < SETTLED * self._enough or self._unchecked >= RECHECK
         self._unchecked = 0 if is_due else self._unchecked + 1
-        worse = self._worse_mirrored(layers, eye) if is_due else None
+        leaning = self._look_leans(layers, eye) if is_due else None
         kept = [
             (update, hypothesis, weight)
             for hypothesis, weight in zip(self.filters, self._log_weights, strict=True)
@@ -171,29 +175,44 @@ class HypothesisBank:
         self._log_weights = [weight + update.log_likelihood / scale for update, _, weight in kept]
         likeliest = kept[int(np.argmax(self._log_weights))][0]
         self._sort_and_prune()
-        if worse is not None:
-            self._weigh_mirrored(worse / scale, layers, eye)
+        if leaning is not None:
+            self._weigh_mirrored(leaning / scale, layers, eye)
         return likeliest
 
-    def _worse_mirrored(self, layers: Sequence[SeenLayer], eye: Eye) -> float:
-        """Return how much larger the squared residuals are under the mirror image of the likeliest pose."""
-        image = mirrored(self.best, self._T_target_marker, eye)
-        return image.misfit(layers, eye) - self.best.misfit(layers, eye)
+    def _look_leans(self, layers: Sequence[SeenLayer], eye: Eye) -> Array:
+        """Return half of what a look says for a tilt rather than its reverse, for each unit of tilt, camera axes (3,).
 
-    def _weigh_mirrored(self, worse: float, layers: Sequence[SeenLayer], eye: Eye) -> None:
-        """Take in what a look says against the mirror image, and follow that too where it fits better.
+        To it, tilts count along the likeliest pose's and across, so that it holds whatever that pose becomes.
+        """
+        T = eye.T_cam_chaser @ self.best.motion.pose_chaser_target() @ self._T_target_marker
+        T_marker_target = inverse(self._T_target_marker)
+        sight = T[:3, 3] / np.linalg.norm(T[:3, 3])
+        tilt = tilt_of(T)
+        size = max(float(np.linalg.norm(tilt)), LEAST_TILT)
+        along = tilt if np.linalg.norm(tilt) > 1e-6 else np.cross(sight, [0.0, 1.0, 0.0])
+        along = along / np.linalg.norm(along)
+        leaning = np.zeros(3)
+        for way in (along, np.cross(sight, along)):
+            poses = [tilted_pose(T, sign * size * way) @ T_marker_target for sign in (1, -1)]
+            one, other = (aligned_misfit(pose, layers, eye) for pose in poses)
+            if np.isfinite(one) and np.isfinite(other):
+                leaning += (other - one) / (4 * size) * way
+        return leaning
+
+    def _weigh_mirrored(self, leaning: Array, layers: Sequence[SeenLayer], eye: Eye) -> None:
+        """Take in what a look says for the tilts, and follow the mirror image too where that fits better.
 
         Corners that are off for long by ``corner_bias_px`` repeat themselves: many looks then count like few.
         """
         fade = 1 - 1 / LOOKS
-        self._against, self._looks = fade * self._against + worse / 2, fade * self._looks + 1
+        self._leaning, self._looks = fade[:, None] * self._leaning + leaning, fade * self._looks + 1
         sigma_px = min(layer.sigma_px for layer in layers)
-        self._evidence = self._against / (1 + self._looks * (self._noise.corner_bias_px / sigma_px) ** 2)
-        if len(self.filters) > 1:
-            return
+        tilt = tilt_of(eye.T_cam_chaser @ self.best.motion.pose_chaser_target() @ self._T_target_marker)
+        repeated = 1 + self._looks * (self._noise.corner_bias_px / sigma_px) ** 2
+        self._evidence = float(np.max(2 * self._leaning @ tilt / repeated))
         image = mirrored(self.best, self._T_target_marker, eye)
         self._is_one_mode = is_one_mode(self.best, image, self._noise)
-        if self._evidence > 0 or self._is_one_mode:
+        if len(self.filters) > 1 or self._evidence > 0 or self._is_one_mode:
             return
         image.distrust_pose(FIRST_LOOK)
         if image.update(layers, eye) is not None:
@@ -203,17 +222,16 @@ class HypothesisBank:
 
     def _sort_and_prune(self) -> None:
         order = np.argsort([-weight for weight in self._log_weights], kind="stable")
-        if order[0] != 0:
-            self._against, self._evidence = -self._against, -self._evidence
         self.filters = [self.filters[k] for k in order]
         self._log_weights = [self._log_weights[k] - self._log_weights[order[0]] for k in order]
         if len(self.filters) == 1:
             return
         apart = distance(*self.filters)
-        self._is_one_mode = is_one_mode(self.filters[0], self.filters[1], self._noise)
         if apart < SAME_POSE:
-            self.filters[0] = self.estimate
-        if apart < SAME_POSE or self._log_weights[-1] < -np.log(self._noise.ambiguity_ratio):
+            self.filters[0] = self.filters[0].merged(self.filters[1], 1.0 - self.probability)
+        image = mirrored(self.best, self._T_target_marker, self._eye)
+        is_same_side = turned_rad(self.filters[1], self.best) < turned_rad(self.filters[1], image)
+        if apart < SAME_POSE or is_same_side or self._log_weights[-1] < -np.log(self._noise.ambiguity_ratio):
             del self.filters[1:], self._log_weights[1:]
 
 
@@ -224,10 +242,14 @@ def distance(a: CornerFilter, b: CornerFilter) -> float:
     return float(apart @ np.linalg.solve(spread, apart))
 
 
+def turned_rad(a: CornerFilter, b: CornerFilter) -> float:
+    """Return how far two filters' attitudes are turned against each other."""
+    return float(np.linalg.norm(a.motion.error_of(b.motion)[ATTITUDE]))
+
+
 def is_one_mode(a: CornerFilter, b: CornerFilter, noise: FilterSection) -> bool:
     """Tell whether two filters' attitudes are so near that a covariance about their mean may stand for both."""
-    apart_rad = float(np.linalg.norm(a.motion.error_of(b.motion)[ATTITUDE]))
-    return apart_rad < noise.one_tilt_rad or distance(a, b) < ONE_MODE
+    return turned_rad(a, b) < noise.one_tilt_rad or distance(a, b) < ONE_MODE
 
 
 MIRROR = np.diag([1.0, 1.0, -1.0])
@@ -242,6 +264,46 @@ def mirrored_pose(T_cam_marker: Array) -> Array:
     sight = T[:3, 3] / np.linalg.norm(T[:3, 3])
     T[:3, :3] = (np.eye(3) - 2 * np.outer(sight, sight)) @ T[:3, :3] @ MIRROR
     return T
+
+
+def tilt_of(T_cam_marker: Array) -> Array:
+    """Return how far a marker is turned from the line of sight: the part of its normal across that, camera axes (3,).
+
+    Its length is the sine of the tilt; the mirror image has the opposite one.
+    """
+    sight, normal = T_cam_marker[:3, 3] / np.linalg.norm(T_cam_marker[:3, 3]), T_cam_marker[:3, 2]
+    return np.asarray(normal - (normal @ sight) * sight)
+
+
+def tilted_pose(T_cam_marker: Array, tilt: Array) -> Array:
+    """Return a pose at the same place that is turned, by the shortest way, to another tilt."""
+    T = T_cam_marker.copy()
+    sight, normal = T[:3, 3] / np.linalg.norm(T[:3, 3]), T[:3, 2]
+    facing = np.copysign(np.sqrt(max(1.0 - float(tilt @ tilt), 0.0)), normal @ sight)
+    wanted = tilt + facing * sight
+    axis = np.cross(normal, wanted)
+    W = skew(axis)
+    T[:3, :3] = (np.eye(3) + W + W @ W / (1 + normal @ wanted)) @ T[:3, :3]
+    return T
+
+
+def aligned_misfit(T_cam_target: Array, layers: Sequence[SeenLayer], eye: Eye) -> float:
+    """Return the squared residuals, in units of their variance, of a pose moved and rolled to fit as well as it can.
+
+    Where a print is and how it is rolled was found with one tilt: held fast, it would speak for that.
+    """
+    motion = Motion.at_rest(inverse(eye.T_cam_chaser) @ T_cam_target)
+    seen = predicted_corners(motion, layers, eye)
+    if seen is None:
+        return np.inf
+    sigma = np.repeat([layer.sigma_px for layer in layers], CORNER_DOF)
+    residual = (np.concatenate([layer.corners_px.ravel() for layer in layers]) - seen[0]) / sigma
+    H = seen[1] / sigma[:, None]
+    sight = motion.R_chaser_target.T @ eye.T_cam_chaser[:3, :3].T @ T_cam_target[:3, 3]
+    free = np.column_stack([H[:, POSITION], H[:, ATTITUDE] @ sight])
+    Q, _ = np.linalg.qr(free)
+    along = Q.T @ residual
+    return float(residual @ residual - along @ along)
 
 
 def mirrored(one: CornerFilter, T_target_marker: Array, eye: Eye) -> CornerFilter:

@@ -218,7 +218,8 @@ class FilterSection(Section):
     history_s: float = Field(default=1.0, ge=0)
     """A frame that comes later than others by up to this is taken at its own time, and they again after it."""
     output_rate_hz: float | None = Field(default=None, gt=0, le=1000)
-    """Live: propagated states at this rate between frames; None: ten a second, once frames stay away."""
+    """Live: propagated states at this rate between frames; None: ten a second, once frames stay away.  A replay gives a
+    state a frame, whatever this says: ticks are of a clock, and what it gives must repeat to the byte."""
     coast_s: float = Field(default=5.0, gt=0)
     """Longest propagation without measurements before LOST."""
 

@@ -20,6 +20,8 @@ RATE_HZ = 10.0
 DURATION_S = 20.0
 RANGES_M = (13.0, 20.0)
 TILTS_RAD = (0.0, float(np.deg2rad(25)))
+HARDER_TILTS_RAD = (0.0, float(np.deg2rad(12)))
+"""So nearly frontal that which way a print is tilted can hardly be seen."""
 GATE = float(chi2.ppf(0.999, df=3))
 NOISE = FilterSection(angular_acceleration_rad_s2=0.002, picture_shift_px=0.0)
 
@@ -31,12 +33,14 @@ class Branches:
     tracked: int = 0
     ambiguous: int = 0
     wrong: int = 0
+    to_track_s: float = DURATION_S
+    """When the first state was in TRACK; all of the run's duration when none was."""
 
 
-def fly(seed: int, noise: FilterSection = NOISE) -> Branches:
+def fly(seed: int, noise: FilterSection = NOISE, tilts_rad: tuple[float, float] = TILTS_RAD) -> Branches:
     """Follow a half-metre marker; wrong is nearer to the mirror image than to truth, which the covariance excludes."""
     rng, mission_ = np.random.default_rng(seed), mission(FlatSection(), side_m=0.5, filter=noise)
-    range_m, tilt_rad, azimuth = rng.uniform(*RANGES_M), rng.uniform(*TILTS_RAD), rng.uniform(0, 2 * np.pi)
+    range_m, tilt_rad, azimuth = rng.uniform(*RANGES_M), rng.uniform(*tilts_rad), rng.uniform(0, 2 * np.pi)
     motion = approach(
         seed,
         start_m=range_m,
@@ -64,6 +68,7 @@ def fly(seed: int, noise: FilterSection = NOISE) -> Branches:
         off = difference(T, estimate)[3:]
         off_mirror = difference(mirrored_pose(marker.T_a_b), T_cam_chaser @ estimate @ T_target_marker)[3:]
         is_nearer = np.linalg.norm(off_mirror) < np.linalg.norm(off)
+        counts.to_track_s = min(counts.to_track_s, float(t_s))
         counts.tracked += 1
         counts.wrong += bool(is_nearer and off @ np.linalg.solve(P, off) > GATE)
     return counts
