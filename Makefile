@@ -26,7 +26,7 @@ $(STAMP): pyproject.toml uv.lock
 	  uv=.uv/bin/uv; \
 	fi; \
 	echo "setup: $(VENV) from uv.lock"; \
-	"$$uv" sync --quiet --frozen --python $(PYTHON) $(addprefix --extra ,$(EXTRAS))
+	"$$uv" sync --quiet --frozen --compile-bytecode --python $(PYTHON) $(addprefix --extra ,$(EXTRAS))
 	@echo "setup: compiling the detector" && $(RUN)/python -c "import astratag"
 	@rm -f $(VENV)/.synced* && touch $@
 
