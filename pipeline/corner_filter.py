@@ -17,6 +17,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs, dtrtrs
 from scipy.stats import chi2
 
 from astratag.camera import Camera
+from astratag.compiled import CUBE, MATRIX, compiled
 from pipeline.dynamics import (
     ATTITUDE,
     CONSIDERED,
@@ -39,7 +40,8 @@ Array = NDArray[np.float64]
 
 CORNER_DOF = 8
 """Image coordinates of the four corners of one black square."""
-NEXT_CORNER, PREVIOUS_CORNER = [1, 2, 3, 0], [3, 0, 1, 2]
+FIRST_OF_POSITION, FIRST_OF_ATTITUDE, FIRST_OF_SHIFT = POSITION.start, ATTITUDE.start, SHIFT.start
+TINY = float(np.finfo(float).tiny)
 SHARPEST = 0.1
 """One plus the cosine between neighbouring edges' normals, bounded so that a needle's corner stays near."""
 NEAREST_M = 1e-3
@@ -319,13 +321,7 @@ def predicted_corners(motion: Motion, layers: Sequence[SeenLayer], eye: Eye) -> 
     off_centre = eye.camera.project(points_cam) - centre
     by_point = (1 + motion.scale) * eye.camera.projection_jacobian(points_cam)
     outward = outward_shift(off_centre.reshape(-1, 4, 2)).reshape(-1, 2)
-
-    H = np.zeros((len(off_centre), 2, STATES))
-    H[:, :, POSITION] = by_point @ R_cam_chaser
-    H[:, :, ATTITUDE] = cross_rows(points_target, by_point @ R_cam_target)
-    H[:, :, EDGE_BIAS] = outward
-    H[:, :, SCALE] = off_centre
-    H[:, 0, SHIFT.start] = H[:, 1, SHIFT.start + 1] = 1.0
+    H = _derivatives(points_target, by_point, eye.T_cam_chaser, R_cam_target, off_centre, outward)
     pixels = centre + (1 + motion.scale) * off_centre + motion.shift_px + motion.edge_bias_px * outward
     if not (np.isfinite(pixels).all() and np.isfinite(H).all()):
         return None
@@ -368,6 +364,32 @@ def _curvature_px(look: Look, step: Array, focal_px: float) -> float:
     return way_px**2 / focal_px + size_px * float(step[ATTITUDE] @ step[ATTITUDE])
 
 
+@compiled(MATRIX, CUBE, MATRIX, MATRIX, MATRIX, MATRIX)
+def _derivatives(
+    points_target: Array, by_point: Array, T_cam_chaser: Array, R_cam_target: Array, off_centre: Array, outward: Array
+) -> Array:
+    """Return how pixels (N, 2) of points (N, 3) follow the error state (N, 2, 16), given how they follow the points."""
+    H = np.zeros((len(by_point), 2, STATES))
+    for n in range(len(by_point)):
+        x, y, z = points_target[n]
+        for axis in range(2):
+            for k in range(3):
+                for j in range(3):
+                    H[n, axis, FIRST_OF_POSITION + k] += by_point[n, axis, j] * T_cam_chaser[j, k]
+            a = b = c = 0.0
+            for j in range(3):
+                a += by_point[n, axis, j] * R_cam_target[j, 0]
+                b += by_point[n, axis, j] * R_cam_target[j, 1]
+                c += by_point[n, axis, j] * R_cam_target[j, 2]
+            H[n, axis, FIRST_OF_ATTITUDE] = y * c - z * b  # a.(w x r) = (r x a).w
+            H[n, axis, FIRST_OF_ATTITUDE + 1] = z * a - x * c
+            H[n, axis, FIRST_OF_ATTITUDE + 2] = x * b - y * a
+            H[n, axis, EDGE_BIAS] = outward[n, axis]
+            H[n, axis, SCALE] = off_centre[n, axis]
+            H[n, axis, FIRST_OF_SHIFT + axis] = 1.0
+    return H
+
+
 def cross_rows(points: Array, rows: Array) -> Array:
     """Return points (N, 3) crossed with each row of matrices (N, 2, 3): a.(w x r) = (r x a).w."""
     x, y, z = points.T[:, :, None]
@@ -380,16 +402,28 @@ def cross_rows(points: Array, rows: Array) -> Array:
 def outward_shift(quads_px: Array) -> Array:
     """Return how corners (L, 4, 2) move when every edge of their quad moves outward by a pixel.
 
-    A corner moves by d with d.n = 1 for the outward normals n of both its edges.  In complex numbers x + i y, in which
-    the conjugate of one times another is dot product + i cross product.
+    A corner moves by d with d.n = 1 for the outward normals n of both its edges.
     """
-    corners = quads_px[..., 0] + 1j * quads_px[..., 1]
-    edges = corners[:, NEXT_CORNER] - corners
-    turn = np.sign(np.sum((edges.conj() * edges[:, NEXT_CORNER]).imag, axis=1, keepdims=True))
-    normals = -1j * turn * edges / np.maximum(np.abs(edges), np.finfo(float).tiny)
-    before = normals[:, PREVIOUS_CORNER]
-    shift = (before + normals) / np.maximum(1 + (before.conj() * normals).real, SHARPEST)
-    return np.stack([shift.real, shift.imag], axis=-1)
+    return _outward_shift(np.ascontiguousarray(quads_px, dtype=float))
+
+
+@compiled(CUBE)
+def _outward_shift(quads_px: Array) -> Array:
+    shift, normals = np.empty(quads_px.shape), np.empty((4, 2))
+    for q in range(len(quads_px)):
+        quad, turn = quads_px[q], 0.0
+        for i in range(4):
+            after, last = (i + 1) % 4, (i + 2) % 4
+            x, y = quad[after, 0] - quad[i, 0], quad[after, 1] - quad[i, 1]
+            turn += x * (quad[last, 1] - quad[after, 1]) - y * (quad[last, 0] - quad[after, 0])
+            length = max(np.sqrt(x * x + y * y), TINY)
+            normals[i, 0], normals[i, 1] = y / length, -x / length
+        for i in range(4):
+            x, y = normals[i]
+            before_x, before_y = normals[(i + 3) % 4]
+            share = np.sign(turn) / max(1 + before_x * x + before_y * y, SHARPEST)
+            shift[q, i, 0], shift[q, i, 1] = share * (before_x + x), share * (before_y + y)
+    return shift
 
 
 def gate_limit(probability: float, dof: int) -> float:
