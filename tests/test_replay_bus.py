@@ -80,6 +80,7 @@ def test_a_direct_replay_is_identical(by_command_line: Path, recording: Path, tm
     assert differences(by_command_line / "run.mcap", tmp_path / "run.mcap", REPEATABLE) == []
 
 
+@pytest.mark.slow
 def test_a_damaged_frame_and_a_calibration_that_changes_are_replayed_alike(recording: Path, tmp_path: Path):
     """Frame 10 is no message, and from frame 20 on the focal length is another: over the bus as direct."""
     odd = tmp_path / "odd.mcap"

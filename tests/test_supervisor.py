@@ -73,6 +73,7 @@ def test_a_viewer_that_dies_does_not_end_a_replay(recording, tmp_path):
     assert [e.stamp.sequence for e, _ in Recording(tmp_path / "run.mcap").envelopes([STATE])] == list(range(40))
 
 
+@pytest.mark.slow
 def test_a_viewer_that_cannot_start_is_not_waited_for(recording, tmp_path):
     """Its file cannot be written: the replay says so and goes on."""
     run_plan = plan(recording, tmp_path, lossless=True, speed="max", viewer=True)
