@@ -1,4 +1,4 @@
-"""Polygons: which of many contours simplify to convex quads.
+"""Polygons: how large many contours are, and which of them simplify to convex quads.
 
 Compiled, because an image has hundreds of contours, and each is simplified at several tolerances.
 """
@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.compiled import BOOL, INDICES, INT, MATRIX, REAL, VECTOR, compiled
+from astratag.compiled import BOOL, CUBE, INDICES, INT, MATRIX, REAL, VECTOR, compiled
 
 Array = NDArray[np.float64]
 
@@ -18,6 +18,9 @@ TOLERANCES_A_SIDE = 5.0
 """How many times the tolerance the shortest side must be, or corners are moved by too much of it."""
 FARTHEST_ROUNDS = 3
 """How often the point farthest from the one before is looked for, to find two that are far apart."""
+TINY = 1e-9
+LEAST_SINE = 0.1
+"""Of the angle at a quad's corner: at a sharper one its sides meet no farther out than at this."""
 
 
 @compiled(MATRIX)
@@ -144,3 +147,53 @@ def convex_quads(
             if bearable:
                 break
     return found, quads
+
+
+@compiled(MATRIX, INDICES)
+def sizes(points: Array, starts: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Return the areas, negative of holes, and the perimeters (N,) of contours.
+
+    Contour i runs through ``points`` (P, 2) from ``starts`` (N + 1,) i on.
+    """
+    count = len(starts) - 1
+    area, perimeter = np.zeros(count), np.zeros(count)
+    for i in range(count):
+        x, y = points[starts[i + 1] - 1]
+        for n in range(starts[i], starts[i + 1]):
+            next_x, next_y = points[n]
+            area[i] += (next_x * y - next_y * x) / 2
+            perimeter[i] += math.sqrt((next_x - x) ** 2 + (next_y - y) ** 2)
+            x, y = next_x, next_y
+    return area, perimeter
+
+
+@compiled(MATRIX, REAL)
+def grown(quad: Array, outset: float) -> Array:
+    """Return a clockwise quad (4, 2) with each side moved out."""
+    along, at = np.empty((4, 2)), np.empty((4, 2))
+    for i in range(4):
+        dx, dy = quad[(i + 1) % 4, 0] - quad[i, 0], quad[(i + 1) % 4, 1] - quad[i, 1]
+        length = max(math.sqrt(dx * dx + dy * dy), TINY)
+        along[i, 0], along[i, 1] = dx / length, dy / length
+    for i in range(4):
+        sine = along[i - 1, 0] * along[i, 1] - along[i - 1, 1] * along[i, 0]
+        for axis in range(2):
+            at[i, axis] = quad[i, axis] + outset * (along[i - 1, axis] - along[i, axis]) / max(sine, LEAST_SINE)
+    return at
+
+
+@compiled(CUBE, REAL, REAL)
+def clockwise(quads: Array, least_side: float, outset: float) -> Array:
+    """Return quads (Q, 4, 2) clockwise and each side moved out, without those that have a shorter side."""
+    kept, count = np.empty(quads.shape), 0
+    for q in range(len(quads)):
+        quad = quads[q]
+        if _shortest(quad) < least_side:
+            continue
+        across = (quad[2, 0] - quad[0, 0]) * (quad[3, 1] - quad[1, 1])
+        turned = across < (quad[2, 1] - quad[0, 1]) * (quad[3, 0] - quad[1, 0])
+        for i in range(4):
+            kept[count, i] = quad[3 - i if turned else i]
+        kept[count] = grown(kept[count], outset)
+        count += 1
+    return kept[:count].copy()

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astratag.binarise import threshold_blocks
-from astratag.polygons import convex_quads
+from astratag.polygons import clockwise, convex_quads, grown, sizes
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -89,7 +89,6 @@ MAX_HULLS, MAX_CUT = 120, 12
 """
 OUTSET_PX, INSET_PX = 0.75, -0.5
 """Contours run through the centres of the outermost ink pixels, or of the white pixels beside a hole."""
-LEAST_SINE = 0.1
 BORDER_PX = 1
 """Outlines this near to the image's border are cut by it."""
 
@@ -227,11 +226,7 @@ def _quads(outlines: Outlines, *, whole: bool) -> Array:
         uncut = _uncut(contours[i], perimeters[i], outlines.size)
         if uncut is not None:
             found[i], quads[i] = True, uncut[:, 0]
-    quads = quads[found]
-    turned = _cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1]) < 0
-    quads[turned] = quads[turned, ::-1]
-    quads = quads[_squared(quads[:, [1, 2, 3, 0]] - quads).min(axis=1) >= MIN_SIDE_PX**2]
-    return outlines.in_image(_grown(quads, outlines.outset_px))
+    return outlines.in_image(clockwise(quads[found], MIN_SIDE_PX, outlines.outset_px))
 
 
 def _bent_quads(outlines: Outlines) -> BentQuads:
@@ -249,7 +244,8 @@ def _bent_quads(outlines: Outlines) -> BentQuads:
     if not contours:
         return BentQuads(*np.zeros((2, 0, 4, 2)))
     corners, bulges = _bulging(contours, corners)
-    return BentQuads(outlines.in_image(_grown(corners, outlines.outset_px)), outlines.scale * bulges)
+    corners = np.array([grown(quad, outlines.outset_px) for quad in corners])
+    return BentQuads(outlines.in_image(corners), outlines.scale * bulges)
 
 
 def _plausible(contours: Sequence[Contour]) -> list[tuple[float, Contour]]:
@@ -260,20 +256,10 @@ def _plausible(contours: Sequence[Contour]) -> list[tuple[float, Contour]]:
     contours = [contour for contour in contours if len(contour) >= 4]
     if not contours:
         return []
-    area, perimeter = _sizes(contours)
+    area, perimeter = sizes(*_joined(contours))
     use = (area >= MIN_SIDE_PX**2) & (perimeter >= MIN_PERIMETER_PX) & (area >= LEAST_ROUNDNESS * perimeter**2)
-    longest = np.flatnonzero(use)[np.argsort(-perimeter[use], kind="stable")[:MAX_CONTOURS]]
+    longest = np.flatnonzero(use)[np.argsort(-perimeter[use], kind="stable")[:MAX_CONTOURS]].tolist()
     return [(float(perimeter[i]), contours[i]) for i in longest]
-
-
-def _sizes(contours: Sequence[Contour]) -> tuple[Array, Array]:
-    """Return the areas, negative of holes, and the perimeters (N,) of contours."""
-    starts = starts_of(contours)
-    points = np.concatenate(contours)[:, 0].astype(float)
-    after = np.roll(points, -1, axis=0)
-    after[np.append(starts[1:], len(points)) - 1] = points[starts]  # each contour ends where it began
-    area = np.add.reduceat(_cross(after, points), starts) / 2
-    return area, np.add.reduceat(np.sqrt(_squared(after - points)), starts)
 
 
 def starts_of(parts: Sequence[Contour]) -> NDArray[np.int64]:
@@ -290,14 +276,6 @@ def _cross(a: Array, b: Array) -> Array:
 def _squared(a: Array) -> Array:
     """Return the squared lengths (...) of vectors (..., 2)."""
     return a[..., 0] * a[..., 0] + a[..., 1] * a[..., 1]
-
-
-def _grown(quads: Array, outset_px: float) -> Array:
-    """Return quads (Q, 4, 2) with each side moved out."""
-    ahead = quads[:, [1, 2, 3, 0]] - quads
-    along = ahead / np.maximum(np.sqrt(_squared(ahead)), 1e-9)[..., None]
-    before = along[:, [3, 0, 1, 2]]
-    return quads + outset_px * (before - along) / np.maximum(_cross(before, along), LEAST_SINE)[..., None]
 
 
 def _simplified_to_quads(
