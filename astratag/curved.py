@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from astratag.align import COARSE_BLUR, COARSE_STEPS, FINE_STEPS, align
 from astratag.camera import Camera
-from astratag.candidates import FRAME, OUTER, Candidate, darker_inside
+from astratag.candidates import FRAME, LEAST_FRAMED, OUTER, Candidate, darker_inside
 from astratag.codes import Reading
 from astratag.codes.acceptance import chance_of_correlation
 from astratag.codes.soft import correlations, hamming
@@ -125,7 +125,7 @@ def _near_sides(polygons: Sequence[Contour], scale: float) -> Array:
 def curved_candidates(gray: Image, bent: Bent, codebook: Codebook, artwork: Artwork) -> list[Candidate]:
     """Return the bent squares that read and look something like a marker, the best about each place, the best first."""
     at = bent.all
-    at = at[darker_inside(sample(gray, bent.project(FRAME)))][:MAX_READ] if len(at) else at
+    at = at[darker_inside(gray, bent.project(FRAME), LEAST_FRAMED)][:MAX_READ] if len(at) else at
     if len(at) == 0:
         return []
     cells, facing = cell_values(gray, bent.project(SAMPLES, at)), bent.facing(_CELL_MIDDLES, at)

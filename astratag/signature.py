@@ -122,7 +122,8 @@ class Codebook:
         self.dictionary = dictionary
         self.false_accept_rate = false_accept_rate
         self.tau_hamming = tau_hamming
-        self._codes = dictionary.oriented.reshape(-1, CELLS).astype(float)
+        self._bits = np.ascontiguousarray(dictionary.oriented.reshape(-1, CELLS))
+        self._codes = self._bits.astype(float)
         self.unit_codes = np.stack([unit(self._codes @ mixing.T + around) for mixing, around in _mixings()])
         """All readings (3, 4 N, 48) at each of ``BLUR_UNITS``, with zero mean and unit length."""
         self._by_cell = np.ascontiguousarray(self.unit_codes.transpose(0, 2, 1))
@@ -162,22 +163,24 @@ class Codebook:
         if len(cells) == 0:
             return []
         levels = np.zeros(len(cells), dtype=np.int64) if side_px is None else blur_level(side_px)
-        best, found = _best_codes(unit(cells), levels, self._by_cell)
-        return self._readings(best, found, cells, np.ones(cells.shape, dtype=bool))
+        best, found, wrong = _best_codes(cells, levels, self._by_cell, self._bits)
+        return self._readings(best, found, wrong, np.full(len(cells), CELLS))
 
     def read_seen(self, cells: Array, seen: NDArray[np.bool_]) -> list[Reading]:
         """Return the best reading of each row of cells (Q, 48) when only those that are ``seen`` (Q, 48) count."""
         found = correlations(cells, seen, self._codes)
         best = found.argmax(axis=1)
-        return self._readings(best, found[np.arange(len(best)), best], cells, seen)
+        wrong = hamming(cells, self._bits[best], seen)
+        return self._readings(best, found[np.arange(len(best)), best], wrong, seen.sum(axis=1))
 
-    def _readings(self, best: NDArray[np.int64], found: Array, cells: Array, seen: NDArray[np.bool_]) -> list[Reading]:
-        """Return the readings that are the ``best`` (Q,) of all codes, and correlate as ``found`` (Q,)."""
-        wrong = hamming(cells, self.dictionary.oriented.reshape(-1, CELLS)[best], seen)
-        rows = zip(best.tolist(), found.tolist(), wrong.tolist(), seen.sum(axis=1).tolist(), strict=True)
+    def _readings(
+        self, best: NDArray[np.int64], found: Array, wrong: NDArray[np.int64], count: NDArray[np.int64]
+    ) -> list[Reading]:
+        """Return the readings that are the ``best`` (Q,) of all codes, correlate as ``found``, and so many are wrong."""
+        rows = zip(best.tolist(), found.tolist(), wrong.tolist(), count.tolist(), strict=True)
         return [
-            Reading(self.dictionary.ids[code // 4], code % 4, correlation, differ, cells=count)
-            for code, correlation, differ, count in rows
+            Reading(self.dictionary.ids[code // 4], code % 4, correlation, differ, cells=cells)
+            for code, correlation, differ, cells in rows
         ]
 
     def read_as(self, cells: Array, marker_id: int, side_px: float | None = None) -> Reading:
@@ -248,24 +251,6 @@ def unit(cells: Array) -> Array:
     return rows
 
 
-@compiled(MATRIX, INDICES, CUBE)
-def _best_codes(cells: Array, level: NDArray[np.int64], codes: Array) -> tuple[NDArray[np.int64], Array]:
-    """Return which code (Q,) each row of unit cells (Q, 48) correlates with best, and how well (Q,).
-
-    ``codes`` (L, 48, K) are of unit length, at the ``level`` (Q,) of blur of each row.
-    """
-    best, correlation = np.empty(len(cells), dtype=np.int64), np.empty(len(cells))
-    for q in range(len(cells)):
-        found = np.zeros(codes.shape[2])
-        for c in range(CELLS):
-            cell, white = cells[q, c], codes[level[q], c]
-            for k in range(len(found)):
-                found[k] += cell * white[k]
-        best[q] = found.argmax()
-        correlation[q] = found[best[q]]
-    return best, correlation
-
-
 def hamming(cells: Array, codes: NDArray[np.uint8], seen: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
     """Return how many of the ``seen`` cells of each row (Q, 48) are on the wrong side of half way from black to white.
 
@@ -287,6 +272,28 @@ def _wrong(cells: Array, codes: NDArray[np.uint8], seen: NDArray[np.bool_]) -> N
         for c in range(CELLS):
             wrong[q] += seen[q, c] and (cells[q, c] > half_way) != (codes[q, c] == 1)
     return wrong
+
+
+@compiled(MATRIX, INDICES, CUBE, BITS)
+def _best_codes(
+    cells: Array, level: NDArray[np.int64], codes: Array, bits: NDArray[np.uint8]
+) -> tuple[NDArray[np.int64], Array, NDArray[np.int64]]:
+    """Return which code (Q,) each row of cells (Q, 48) correlates with best, how well (Q,), and how many are wrong (Q,).
+
+    ``codes`` (L, 48, K) are of unit length, at the ``level`` (Q,) of blur of each row; ``bits`` (K, 48) as printed.
+    """
+    rows, best, correlation = unit(cells), np.empty(len(cells), dtype=np.int64), np.empty(len(cells))
+    printed = np.empty(cells.shape, dtype=np.uint8)
+    for q in range(len(cells)):
+        found = np.zeros(codes.shape[2])
+        for c in range(CELLS):
+            cell, white = rows[q, c], codes[level[q], c]
+            for k in range(len(found)):
+                found[k] += cell * white[k]
+        best[q] = found.argmax()
+        correlation[q] = found[best[q]]
+        printed[q] = bits[best[q]]
+    return best, correlation, _wrong(cells, printed, np.ones(cells.shape, dtype=np.bool_))
 
 
 def cell_values(gray: Brightness, samples_px: Places) -> Array:
