@@ -176,7 +176,7 @@ class Codebook:
     def _readings(
         self, best: NDArray[np.int64], found: Array, wrong: NDArray[np.int64], count: NDArray[np.int64]
     ) -> list[Reading]:
-        """Return the readings that are the ``best`` (Q,) of all codes, correlate as ``found``, and so many are wrong."""
+        """Return the readings: the ``best`` (Q,) of all codes, how they correlate, and of how many cells some are wrong."""
         rows = zip(best.tolist(), found.tolist(), wrong.tolist(), count.tolist(), strict=True)
         return [
             Reading(self.dictionary.ids[code // 4], code % 4, correlation, differ, cells=cells)
@@ -278,7 +278,7 @@ def _wrong(cells: Array, codes: NDArray[np.uint8], seen: NDArray[np.bool_]) -> N
 def _best_codes(
     cells: Array, level: NDArray[np.int64], codes: Array, bits: NDArray[np.uint8]
 ) -> tuple[NDArray[np.int64], Array, NDArray[np.int64]]:
-    """Return which code (Q,) each row of cells (Q, 48) correlates with best, how well (Q,), and how many are wrong (Q,).
+    """Return which code (Q,) each row of cells (Q, 48) correlates with best, how well (Q,), and its wrong cells (Q,).
 
     ``codes`` (L, 48, K) are of unit length, at the ``level`` (Q,) of blur of each row; ``bits`` (K, 48) as printed.
     """

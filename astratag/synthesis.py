@@ -438,4 +438,4 @@ def _picture(signature: bytes, softness: float) -> Picture:
         channels.append(
             cv2.GaussianBlur(small, (0, 0), deviation, borderType=cv2.BORDER_REPLICATE) if softness else small
         )
-    return Picture(*channels, softness, texel)
+    return Picture(channels[0], channels[1], softness, texel)
