@@ -176,7 +176,7 @@ class Codebook:
     def _readings(
         self, best: NDArray[np.int64], found: Array, wrong: NDArray[np.int64], count: NDArray[np.int64]
     ) -> list[Reading]:
-        """Return the readings: the ``best`` (Q,) of all codes, how they correlate, and of how many cells some are wrong."""
+        """Return the readings: the ``best`` (Q,) of all codes, how these correlate, and how many cells are wrong."""
         rows = zip(best.tolist(), found.tolist(), wrong.tolist(), count.tolist(), strict=True)
         return [
             Reading(self.dictionary.ids[code // 4], code % 4, correlation, differ, cells=cells)
