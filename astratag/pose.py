@@ -93,8 +93,9 @@ def planar_poses(
     lens = camera.lens
     poses, *told = _explaining(np.array(starts), known is not None, points_marker, corners_px, sigma_px, lens)
     given = [known, *poses[1:]] if known is not None else list(poses)
-    found = zip(given, *(each.tolist() for each in told), strict=True)
-    return tuple(sorted((PlanarPose(*one) for one in found), key=lambda planar: -planar.probability))
+    found = [PlanarPose(*one) for one in zip(given, *(each.tolist() for each in told), strict=True)]
+    seen = (planar for planar in found if math.isfinite(planar.reprojection_rms_px))
+    return tuple(sorted(seen, key=lambda planar: -planar.probability))
 
 
 @compiled(MATRIX)
@@ -247,5 +248,7 @@ def _explaining(
                 poses[p] = refined
         squared_px = _squared_errors(poses[p], points_marker, seen_px, lens)
         rms_px[p], misfit[p] = math.sqrt(squared_px.mean()), (squared_px / sigma_px**2).sum()
+        if not math.isfinite(misfit[p]):
+            rms_px[p] = misfit[p] = np.inf
     likely = np.exp(-0.5 * (misfit - misfit.min()))
     return poses, rms_px, likely / likely.sum()

@@ -177,8 +177,8 @@ def _require_one_map(
         if worse >= least or sum(other.dropped.values()) > sum(bundle.dropped.values()):
             continue
         for marker_id in bundle.ids:
-            places = (each.state.T_target_marker[marker_id] for each in (other, bundle))
-            if is_elsewhere(*places, bundle, marker_id):
+            there, here = (each.state.T_target_marker[marker_id] for each in (other, bundle))
+            if is_elsewhere(there, here, bundle, marker_id):
                 raise MapError(
                     f"which way marker {marker_id} is tilted on the target cannot be told: "
                     "show it nearer, or more turned"
