@@ -165,10 +165,10 @@ class Describer:
 
     def match_near(self, view: View, marker_id: int, warp: FittedWarp, method: str) -> Detection | None:
         """Return a marker whose print lies where ``warp`` has it to a fraction of a cell, by all its pixels."""
-        aligned = self._synthesis.align(view.light, warp, marker_id, PIXEL_BLUR)
+        aligned = self._synthesis.align(view.lit, warp, marker_id, PIXEL_BLUR)
         if aligned is None or aligned.correlation < LEAST_POLISHED:
             return None
-        scores = self._synthesis.read(view.light, aligned.warp, aligned.blur_px)
+        scores = self._synthesis.read(view.lit, aligned.warp, aligned.blur_px)
         row = self.dictionary.row(marker_id)
         if scores[row, 0] < self._accept_of_pixels or scores.argmax() != 4 * row:
             return None
@@ -207,7 +207,7 @@ class Describer:
             poses = [detection.T_cam_marker, *mirrored]
             starts = [PoseWarp(view.camera, spec.side_m, spec.surface, T_cam_marker) for T_cam_marker in poses]
         align = partial(self._synthesis.align, settled_px=POLISHED_TO_PX)
-        aligned = [align(view.light, start, detection.marker_id, PIXEL_BLUR) for start in starts]
+        aligned = [align(view.lit, start, detection.marker_id, PIXEL_BLUR) for start in starts]
         best = max((one for one in aligned if one is not None), key=lambda one: one.correlation, default=None)
         if best is None or best.correlation < LEAST_POLISHED:
             return detection
@@ -263,7 +263,7 @@ class Describer:
         Only ``among`` (48,) of its cells when these are given.
         """
         if relit:
-            cells, seen = relit_layer(view.light, warp, layer_points(RELIT_SAMPLES, LAYERS[layer]))
+            cells, seen = relit_layer(view.lit, warp, layer_points(RELIT_SAMPLES, LAYERS[layer]))
             return self._codebook.read_seen_as(cells, seen if among is None else seen & among, marker_id)
         cells = layer_cells(view.light, warp, layer)
         if among is None:

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from astratag.compiled import INDICES, INT, MATRIX, REAL, VECTOR, array, compiled
 from astratag.detection import LayerDetection
 from astratag.edges import ALONG, EDGES, POINTS_PER_EDGE
-from astratag.fit import SHARP_REACH_PX, EdgeFit, followed
+from astratag.fit import EdgeFit, followed
 from astratag.geometry import LAYERS, square
+from astratag.pulls import SHARP_REACH_PX
 from astratag.warp import FittedWarp
 
 Array = NDArray[np.float64]
@@ -32,11 +33,11 @@ def measure_layers(fit: EdgeFit[FittedWarp], shape: tuple[int, int]) -> tuple[La
     """
     corners, sigma_px = _measured(
         fit.before(_CORNER_PROBES),
-        fit.points.edge,
+        fit.edges,
         fit.offset_px,
         fit.weight,
         fit.shared_px2,
-        fit.points.lie.reach_px,
+        fit.reach_px,
         *shape,
     )
     seen = np.flatnonzero(sigma_px < np.inf).tolist()

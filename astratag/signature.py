@@ -20,13 +20,13 @@ from astratag.codes.acceptance import FALSE_ACCEPT_RATE
 from astratag.codes.soft import correlations
 from astratag.compiled import (
     BITS,
-    BRIGHTNESS,
     CUBE,
     FLAG_MATRIX,
     GRAY,
     INDICES,
     MATRIX,
     PLACES_OF_MANY,
+    VECTOR,
     compiled,
 )
 from astratag.dictionary import Dictionary
@@ -40,7 +40,7 @@ from astratag.geometry import (
     layer_points,
     square,
 )
-from astratag.sampling import Brightness, Places, between, bilinear, sample
+from astratag.sampling import AS_GRAY, Light, Places, between, fading, light_between, sample
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -296,13 +296,16 @@ def _best_codes(
     return best, correlation, _wrong(cells, printed, np.ones(cells.shape, dtype=np.bool_))
 
 
-def cell_values(gray: Brightness, samples_px: Places) -> Array:
-    """Return the 48 cell means (Q, 48), black level removed, of patterns sampled at ``SAMPLES`` (Q, S, 2)."""
-    return _cells(gray, np.ascontiguousarray(samples_px), _ILLUMINATION)
+def cell_values(gray: Image, samples_px: Places, of_gray: Array = AS_GRAY) -> Array:
+    """Return the 48 cell means (Q, 48), black level removed, of patterns sampled at ``SAMPLES`` (Q, S, 2).
+
+    Of what ``of_gray`` (256,) makes of each gray value.
+    """
+    return _cells(gray, of_gray, np.ascontiguousarray(samples_px), _ILLUMINATION)
 
 
-@compiled(BRIGHTNESS, PLACES_OF_MANY, MATRIX)
-def _cells(gray: NDArray, samples_px: NDArray, illumination: Array) -> Array:
+@compiled(GRAY, VECTOR, PLACES_OF_MANY, MATRIX)
+def _cells(gray: Image, of_gray: Array, samples_px: NDArray, illumination: Array) -> Array:
     """Return cells (Q, 48) of patterns sampled at cells, and where they are black, (Q, S, 2).
 
     Each black sample adds a row of ``illumination`` (B, 48) to the black level at the cells.
@@ -311,7 +314,8 @@ def _cells(gray: NDArray, samples_px: NDArray, illumination: Array) -> Array:
     values = np.empty(samples_px.shape[1])
     for q in range(len(cells)):
         for s in range(len(values)):
-            values[s] = bilinear(gray, samples_px[q, s, 0], samples_px[q, s, 1])
+            x, y = samples_px[q, s, 0], samples_px[q, s, 1]
+            values[s] = light_between(gray, of_gray, x, y) * fading(x, y, gray.shape[0], gray.shape[1])
         for c in range(CELLS):
             cells[q, c] = values[c * SAMPLES_A_CELL : (c + 1) * SAMPLES_A_CELL].mean()
         for b in range(len(illumination)):
@@ -320,9 +324,9 @@ def _cells(gray: NDArray, samples_px: NDArray, illumination: Array) -> Array:
     return cells
 
 
-def layer_cells(gray: Brightness, warp: Warp, layer: int) -> Array:
+def layer_cells(light: Light, warp: Warp, layer: int) -> Array:
     """Return the cells (48,) of one layer of a marker whose print is warped into the image."""
-    return cell_values(gray, warp(_LAYER_SAMPLES[layer])[None])[0]
+    return cell_values(light.gray, warp(_LAYER_SAMPLES[layer])[None], light.of_gray)[0]
 
 
 class Artwork:
