@@ -34,7 +34,7 @@ from astratag.surface import Cylinder, Flat, Surface
 from astratag.synthesis import Alignment, Synthesis
 from astratag.transforms import difference
 from astratag.view import View
-from astratag.warp import OUTSIDE_PX, FittedWarp, HomographyWarp, PoseWarp, sides_of
+from astratag.warp import OUTSIDE_PX, FittedWarp, HomographyWarp, PoseWarp, quads_inside, sides_of
 
 Array = NDArray[np.float64]
 
@@ -237,7 +237,7 @@ class Describer:
         of which enough cells are in it.
         """
         best: Reading | None = None
-        whole = [inside(corners, view.gray.shape) for corners in warp(CELLS_WITHIN)]
+        whole = quads_inside(warp(CELLS_WITHIN), *view.gray.shape).tolist()
         for layer in LAYERS:
             seen = None
             if not any(whole):
@@ -284,7 +284,7 @@ def _listed(markers: Mapping[int, MarkerSpec] | None, dictionary: Dictionary) ->
 
 def inside(corners_px: Array, shape: tuple[int, ...]) -> bool:
     """Return whether all corners (4, 2) are inside an image of a shape."""
-    return all(0 <= x <= shape[1] - 1 and 0 <= y <= shape[0] - 1 for x, y in corners_px.tolist())
+    return bool(quads_inside(np.ascontiguousarray(corners_px[None], dtype=float), *shape)[0])
 
 
 def lead(scores: Array, layer: int) -> float:
@@ -300,7 +300,7 @@ def _apart(T_cam_marker: Array, other: Array) -> bool:
 def outer_corners(warp: FittedWarp) -> Array:
     """Return the print's outer corners (4, 2) in the image; one behind the camera is where its sides' lines meet."""
     corners_px = warp(OUTER)
-    if (corners_px > OUTSIDE_PX).all():
+    if corners_px.min() > OUTSIDE_PX:
         return corners_px
     inside_px = warp(SQUARES[-1])
     H = cv2.getPerspectiveTransform(SQUARES[-1].astype(np.float32), inside_px.astype(np.float32))

@@ -24,6 +24,7 @@ from astratag.compiled import (
     FLAG_MATRIX,
     GRAY,
     INDICES,
+    INT,
     MATRIX,
     PLACES_OF_MANY,
     VECTOR,
@@ -40,6 +41,7 @@ from astratag.geometry import (
     layer_points,
     square,
 )
+from astratag.normal import dot
 from astratag.sampling import AS_GRAY, Light, Places, between, fading, light_between, sample
 
 Array = NDArray[np.float64]
@@ -188,19 +190,15 @@ class Codebook:
 
         One that looks ``side_px`` large, or as blurred as chance explains least.
         """
-        row = self.dictionary.row(marker_id)
-        found = (self._upright[row] @ unit(cells[None])[0]).tolist()
-        if side_px is None:
-            level = max(range(len(found)), key=lambda i: found[i] - self._least_of_levels[i])
-        else:
-            level = int(blur_level(side_px))
-        wrong = int(hamming(cells[None], self.dictionary.signatures[row : row + 1])[0])
-        return Reading(marker_id, 0, found[level], wrong, cells=BLURRED_CELLS[level])
+        row, level = self.dictionary.row(marker_id), -1 if side_px is None else int(blur_level(side_px))
+        printed = self.dictionary.signatures[row : row + 1]
+        correlation, level, wrong = _read_as(cells[None], self._upright[row], printed, self._least_of_levels, level)
+        return Reading(marker_id, 0, correlation, wrong, cells=BLURRED_CELLS[level])
 
     @cached_property
-    def _least_of_levels(self) -> list[float]:
-        """Return which correlation with codes at each of ``BLUR_UNITS`` chance rarely exceeds."""
-        return [self.least(1, worth) for worth in BLURRED_CELLS]
+    def _least_of_levels(self) -> Array:
+        """Return which correlation (3,) with codes at each of ``BLUR_UNITS`` chance rarely exceeds."""
+        return np.array([self.least(1, worth) for worth in BLURRED_CELLS])
 
     def read_seen_as(self, cells: Array, seen: NDArray[np.bool_], marker_id: int) -> Reading:
         """Return how well the ``seen`` (48,) of cells (48,) fit an upright marker of a known identity."""
@@ -294,6 +292,23 @@ def _best_codes(
         correlation[q] = found[best[q]]
         printed[q] = bits[best[q]]
     return best, correlation, _wrong(cells, printed, np.ones(cells.shape, dtype=np.bool_))
+
+
+@compiled(MATRIX, MATRIX, BITS, VECTOR, INT)
+def _read_as(
+    cells: Array, codes: Array, printed: NDArray[np.uint8], least: Array, level: int
+) -> tuple[float, int, int]:
+    """Return how well cells (1, 48) correlate with a code, at which level of blur, and how many of them are wrong.
+
+    ``codes`` (L, 48) are of unit length and ``printed`` (1, 48) as it is; a negative ``level`` is the one at which the
+    correlation most exceeds the ``least`` (L,).
+    """
+    row, found = unit(cells)[0], np.empty(len(codes))
+    for k in range(len(codes)):
+        found[k] = dot(codes[k], row)
+    if level < 0:
+        level = int((found - least).argmax())
+    return found[level], level, _wrong(cells, printed, np.ones(cells.shape, dtype=np.bool_))[0]
 
 
 def cell_values(gray: Image, samples_px: Places, of_gray: Array = AS_GRAY) -> Array:
