@@ -25,6 +25,9 @@ Array = NDArray[np.float64]
 
 OUTSIDE_PX = -1e4
 """Where points behind the camera are said to be: far outside every image."""
+FREE = np.full(8, np.inf)
+FREE.flags.writeable = False
+"""Of parameters that one step may take anywhere, not to be changed."""
 BEND_STEP_PX = 3.0
 LEAST_AREA = 1e-9
 LEAST_DEPTH = 1e-6
@@ -106,7 +109,7 @@ class HomographyWarp:
 
     def step_sigma(self) -> Array:
         """Return no limits (8,)."""
-        return np.full(8, np.inf)
+        return FREE[:8]
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +149,7 @@ class BentWarp:
 
     def step_sigma(self) -> Array:
         """Return limits (14,) on the bend only: outer edges alone do not tell how it stretches the inside."""
-        return np.concatenate([np.full(8, np.inf), np.full(6, BEND_STEP_PX)])
+        return np.concatenate([FREE[:8], np.full(6, BEND_STEP_PX)])
 
     @classmethod
     def from_points(cls, template: Array, points_px: Array) -> BentWarp:
@@ -169,11 +172,12 @@ def on_surface(surface: Surface, side_m: float, template: Array) -> tuple[Array,
     if template.flags.writeable:
         return _on_surface(surface, side_m, np.asarray(template, dtype=float).tobytes())
     key = (surface, side_m, id(template))
-    if key not in _KEPT:
+    kept = _KEPT.get(key)
+    if kept is None:
         if len(_KEPT) >= MOST_KEPT:
             _KEPT.clear()
-        _KEPT[key] = (template, *_on_surface(surface, side_m, np.asarray(template, dtype=float).tobytes()))
-    return _KEPT[key][1:]
+        kept = _KEPT[key] = (template, *_on_surface(surface, side_m, np.asarray(template, dtype=float).tobytes()))
+    return kept[1:]
 
 
 _KEPT: dict[tuple[Surface, float, int], tuple[Array, Array, Array]] = {}
@@ -231,7 +235,7 @@ class PoseWarp:
 
     def step_sigma(self) -> Array:
         """Return no limits (6,)."""
-        return np.full(6, np.inf)
+        return FREE[:6]
 
     @property
     def curved(self) -> bool:
