@@ -196,8 +196,8 @@ def _projection_jacobian(points_cam: Array, lens: Array) -> Array:
     J = np.empty((len(points_cam), 2, 3))
     for i in range(len(points_cam)):
         x, y, z = points_cam[i]
-        J[i, 0] = pixel_slope(x, y, z, lens, 1.0, 0.0)
-        J[i, 1] = pixel_slope(x, y, z, lens, 0.0, 1.0)
+        J[i, 0, 0], J[i, 0, 1], J[i, 0, 2] = pixel_slope(x, y, z, lens, 1.0, 0.0)
+        J[i, 1, 0], J[i, 1, 1], J[i, 1, 2] = pixel_slope(x, y, z, lens, 0.0, 1.0)
     return J
 
 

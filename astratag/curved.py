@@ -24,8 +24,9 @@ from astratag.geometry import (
     cell_polygons,
     layer_points,
 )
-from astratag.grow import ALL_EDGES, Fit, Light, layer_side_px, settle
+from astratag.grow import ALL_EDGES, Fit, layer_side_px, settle
 from astratag.neighbours import Crossings
+from astratag.sampling import AS_GRAY, Light
 from astratag.search import Contour, Outlines, starts_of
 from astratag.signature import SAMPLES, Artwork, Codebook, Warp, cell_values, layer_cells, sample, unit
 from astratag.warp import OUTSIDE_PX, FittedWarp
@@ -243,7 +244,7 @@ class LayerReading(NamedTuple):
 
 def _read(gray: Image, warp: FittedWarp, layer: int, marker_id: int, codebook: Codebook) -> LayerReading:
     """Return what the cells in view of one layer of a print say."""
-    cells, kept = layer_cells(gray, warp, layer), cells_in_view(warp, layer, gray.shape)
+    cells, kept = layer_cells(Light(gray, AS_GRAY), warp, layer), cells_in_view(warp, layer, gray.shape)
     count = int(kept.sum())
     if count < LEAST_CELLS:
         return LayerReading(Reading(marker_id, 0, 0.0, CELLS), 1.0)

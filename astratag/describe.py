@@ -34,7 +34,7 @@ from astratag.surface import Cylinder, Flat, Surface
 from astratag.synthesis import Alignment, Synthesis
 from astratag.transforms import difference
 from astratag.view import View
-from astratag.warp import OUTSIDE_PX, FittedWarp, HomographyWarp, PoseWarp, sides_of
+from astratag.warp import OUTSIDE_PX, FittedWarp, HomographyWarp, PoseWarp, quads_inside, sides_of
 
 Array = NDArray[np.float64]
 
@@ -165,10 +165,10 @@ class Describer:
 
     def match_near(self, view: View, marker_id: int, warp: FittedWarp, method: str) -> Detection | None:
         """Return a marker whose print lies where ``warp`` has it to a fraction of a cell, by all its pixels."""
-        aligned = self._synthesis.align(view.light, warp, marker_id, PIXEL_BLUR)
+        aligned = self._synthesis.align(view.lit, warp, marker_id, PIXEL_BLUR)
         if aligned is None or aligned.correlation < LEAST_POLISHED:
             return None
-        scores = self._synthesis.read(view.light, aligned.warp, aligned.blur_px)
+        scores = self._synthesis.read(view.lit, aligned.warp, aligned.blur_px)
         row = self.dictionary.row(marker_id)
         if scores[row, 0] < self._accept_of_pixels or scores.argmax() != 4 * row:
             return None
@@ -207,7 +207,7 @@ class Describer:
             poses = [detection.T_cam_marker, *mirrored]
             starts = [PoseWarp(view.camera, spec.side_m, spec.surface, T_cam_marker) for T_cam_marker in poses]
         align = partial(self._synthesis.align, settled_px=POLISHED_TO_PX)
-        aligned = [align(view.light, start, detection.marker_id, PIXEL_BLUR) for start in starts]
+        aligned = [align(view.lit, start, detection.marker_id, PIXEL_BLUR) for start in starts]
         best = max((one for one in aligned if one is not None), key=lambda one: one.correlation, default=None)
         if best is None or best.correlation < LEAST_POLISHED:
             return detection
@@ -237,7 +237,7 @@ class Describer:
         of which enough cells are in it.
         """
         best: Reading | None = None
-        whole = [inside(corners, view.gray.shape) for corners in warp(CELLS_WITHIN)]
+        whole = quads_inside(warp(CELLS_WITHIN), *view.gray.shape).tolist()
         for layer in LAYERS:
             seen = None
             if not any(whole):
@@ -263,7 +263,7 @@ class Describer:
         Only ``among`` (48,) of its cells when these are given.
         """
         if relit:
-            cells, seen = relit_layer(view.light, warp, layer_points(RELIT_SAMPLES, LAYERS[layer]))
+            cells, seen = relit_layer(view.lit, warp, layer_points(RELIT_SAMPLES, LAYERS[layer]))
             return self._codebook.read_seen_as(cells, seen if among is None else seen & among, marker_id)
         cells = layer_cells(view.light, warp, layer)
         if among is None:
@@ -284,7 +284,7 @@ def _listed(markers: Mapping[int, MarkerSpec] | None, dictionary: Dictionary) ->
 
 def inside(corners_px: Array, shape: tuple[int, ...]) -> bool:
     """Return whether all corners (4, 2) are inside an image of a shape."""
-    return all(0 <= x <= shape[1] - 1 and 0 <= y <= shape[0] - 1 for x, y in corners_px.tolist())
+    return bool(quads_inside(np.ascontiguousarray(corners_px[None], dtype=float), *shape)[0])
 
 
 def lead(scores: Array, layer: int) -> float:
@@ -300,7 +300,7 @@ def _apart(T_cam_marker: Array, other: Array) -> bool:
 def outer_corners(warp: FittedWarp) -> Array:
     """Return the print's outer corners (4, 2) in the image; one behind the camera is where its sides' lines meet."""
     corners_px = warp(OUTER)
-    if (corners_px > OUTSIDE_PX).all():
+    if corners_px.min() > OUTSIDE_PX:
         return corners_px
     inside_px = warp(SQUARES[-1])
     H = cv2.getPerspectiveTransform(SQUARES[-1].astype(np.float32), inside_px.astype(np.float32))

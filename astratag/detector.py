@@ -38,6 +38,7 @@ from astratag.dictionary import Dictionary
 from astratag.edges import Transfer, inverse_transfer
 from astratag.effort import COST, Effort, first_distinct
 from astratag.matching import rough_matches
+from astratag.sampling import Light
 from astratag.search import (
     BROAD,
     COARSE,
@@ -112,8 +113,8 @@ class Detector(Confirmer):
         super().__init__(
             dictionary, side_m, surface, markers, false_accept_rate=false_accept_rate, tau_hamming=tau_hamming
         )
-        self._light_of = inverse_transfer(transfer)
-        self._light = np.zeros((0, 0), dtype=np.float32)
+        self._of_gray = inverse_transfer(transfer).astype(float)
+        self._lit = np.zeros((0, 0), dtype=np.float32)
 
     def detect(self, image: NDArray[np.uint8], camera: Camera | None = None) -> list[Detection]:
         """Return the markers in a gray (H, W) or BGR (H, W, 3) uint8 image, the surest first; poses need ``camera``.
@@ -173,20 +174,16 @@ class Detector(Confirmer):
     ) -> View:
         """Return an image made ready: all of it, or only ``boxes`` ((2, 2) pixels: low and high x, y) of its light.
 
-        The light is kept in one buffer, which the next call overwrites: fresh memory costs more than the table.
+        The light is kept in one buffer, which the next image's overwrites: fresh memory costs more than the table.
         Raises ValueError as ``detect`` does.
         """
         gray = as_gray(image)
         if camera is not None:
             instance(camera, Camera, "camera", "Camera.load(path) reads one")
             camera.require_size(gray.shape[1], gray.shape[0])
-        if self._light.shape != gray.shape:
-            self._light = np.zeros(gray.shape, dtype=np.float32)
-        whole = np.array([(0, 0), gray.shape[::-1]])
-        for (left, top), (right, bottom) in [whole] if boxes is None else boxes:
-            part = slice(int(top), int(bottom)), slice(int(left), int(right))
-            cv2.LUT(gray[part], self._light_of, dst=self._light[part])
-        return View(gray, self._light, camera, Effort(gray.size))
+        if self._lit.shape != gray.shape:
+            self._lit = np.zeros(gray.shape, dtype=np.float32)
+        return View(gray, Light(gray, self._of_gray), camera, Effort(gray.size), self._lit, boxes)
 
     def search(self, view: View, outlines: Outlines, *, whole: bool = False) -> list[Detection]:
         """Return the markers among outlines read as if flat, each once, the surest first; see ``quads_of``."""
@@ -199,7 +196,7 @@ class Detector(Confirmer):
             COST.relit * min(len(quads), MAX_RELIT_READ)
         ):
             return []
-        return surest(self._confirm_all(view, relit_candidates(view.gray, view.light, quads, self._codebook)))
+        return surest(self._confirm_all(view, relit_candidates(view.gray, view.lit, quads, self._codebook)))
 
     def _search_bent(self, view: View, outlines: Outlines) -> list[Detection]:
         """Return the markers among outlines bent about cylinders, none when every marker is on a plane."""
@@ -250,7 +247,7 @@ class Detector(Confirmer):
             fresh = first_distinct(framed(view.gray, quads), tried, MAX_READ_BY_PIXELS - len(tried))
             fresh = fresh[: view.effort.afford(COST.by_pixels, len(fresh))]
             tried = np.concatenate([tried, fresh])
-            rough = rough_matches(self._synthesis, view.light, fresh, PIXEL_BLUR)[:left]
+            rough = rough_matches(self._synthesis, view.lit, fresh, PIXEL_BLUR)[:left]
             rough = rough[: view.effort.afford(COST.matched, len(rough))]
             left -= len(rough)
             found = [seen for seen in (self._confirm_pixels(view, one) for one in rough) if seen is not None]

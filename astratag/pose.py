@@ -18,7 +18,7 @@ from astratag.ippe import plane_poses
 from astratag.normal import dot, factored, inverse
 from astratag.surface import Surface
 from astratag.transforms import perturbed
-from astratag.warp import PoseWarp, on_surface, pose_jacobian, seen_from
+from astratag.warp import PoseWarp, in_camera, on_surface, pose_jacobian, seen_from
 
 Array = NDArray[np.float64]
 
@@ -127,10 +127,8 @@ def _squared_errors(T: Array, points_marker: Array, seen_px: Array, lens: Array)
     """Return how far points (3, N) of the marker are from where they are seen (N, 2) under a pose: (N,) px^2."""
     squared_px = np.empty(len(seen_px))
     for i in range(len(seen_px)):
-        x, y, z = points_marker[0, i], points_marker[1, i], points_marker[2, i]
-        depth = max(T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3], NEAREST_M)
-        right = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
-        u, v = pixel(right, T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3], depth, lens)
+        x, y, z = in_camera(T, points_marker[0, i], points_marker[1, i], points_marker[2, i])
+        u, v = pixel(x, y, max(z, NEAREST_M), lens)
         squared_px[i] = (u - seen_px[i, 0]) ** 2 + (v - seen_px[i, 1]) ** 2
     return squared_px
 

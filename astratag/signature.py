@@ -20,13 +20,14 @@ from astratag.codes.acceptance import FALSE_ACCEPT_RATE
 from astratag.codes.soft import correlations
 from astratag.compiled import (
     BITS,
-    BRIGHTNESS,
     CUBE,
     FLAG_MATRIX,
     GRAY,
     INDICES,
+    INT,
     MATRIX,
     PLACES_OF_MANY,
+    VECTOR,
     compiled,
 )
 from astratag.dictionary import Dictionary
@@ -40,7 +41,8 @@ from astratag.geometry import (
     layer_points,
     square,
 )
-from astratag.sampling import Brightness, Places, between, bilinear, sample
+from astratag.normal import dot
+from astratag.sampling import AS_GRAY, Light, Places, between, fading, light_between, sample
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -188,19 +190,15 @@ class Codebook:
 
         One that looks ``side_px`` large, or as blurred as chance explains least.
         """
-        row = self.dictionary.row(marker_id)
-        found = (self._upright[row] @ unit(cells[None])[0]).tolist()
-        if side_px is None:
-            level = max(range(len(found)), key=lambda i: found[i] - self._least_of_levels[i])
-        else:
-            level = int(blur_level(side_px))
-        wrong = int(hamming(cells[None], self.dictionary.signatures[row : row + 1])[0])
-        return Reading(marker_id, 0, found[level], wrong, cells=BLURRED_CELLS[level])
+        row, level = self.dictionary.row(marker_id), -1 if side_px is None else int(blur_level(side_px))
+        printed = self.dictionary.signatures[row : row + 1]
+        correlation, level, wrong = _read_as(cells[None], self._upright[row], printed, self._least_of_levels, level)
+        return Reading(marker_id, 0, correlation, wrong, cells=BLURRED_CELLS[level])
 
     @cached_property
-    def _least_of_levels(self) -> list[float]:
-        """Return which correlation with codes at each of ``BLUR_UNITS`` chance rarely exceeds."""
-        return [self.least(1, worth) for worth in BLURRED_CELLS]
+    def _least_of_levels(self) -> Array:
+        """Return which correlation (3,) with codes at each of ``BLUR_UNITS`` chance rarely exceeds."""
+        return np.array([self.least(1, worth) for worth in BLURRED_CELLS])
 
     def read_seen_as(self, cells: Array, seen: NDArray[np.bool_], marker_id: int) -> Reading:
         """Return how well the ``seen`` (48,) of cells (48,) fit an upright marker of a known identity."""
@@ -296,13 +294,33 @@ def _best_codes(
     return best, correlation, _wrong(cells, printed, np.ones(cells.shape, dtype=np.bool_))
 
 
-def cell_values(gray: Brightness, samples_px: Places) -> Array:
-    """Return the 48 cell means (Q, 48), black level removed, of patterns sampled at ``SAMPLES`` (Q, S, 2)."""
-    return _cells(gray, np.ascontiguousarray(samples_px), _ILLUMINATION)
+@compiled(MATRIX, MATRIX, BITS, VECTOR, INT)
+def _read_as(
+    cells: Array, codes: Array, printed: NDArray[np.uint8], least: Array, level: int
+) -> tuple[float, int, int]:
+    """Return how well cells (1, 48) correlate with a code, at which level of blur, and how many of them are wrong.
+
+    ``codes`` (L, 48) are of unit length and ``printed`` (1, 48) as it is; a negative ``level`` is the one at which the
+    correlation most exceeds the ``least`` (L,).
+    """
+    row, found = unit(cells)[0], np.empty(len(codes))
+    for k in range(len(codes)):
+        found[k] = dot(codes[k], row)
+    if level < 0:
+        level = int((found - least).argmax())
+    return found[level], level, _wrong(cells, printed, np.ones(cells.shape, dtype=np.bool_))[0]
 
 
-@compiled(BRIGHTNESS, PLACES_OF_MANY, MATRIX)
-def _cells(gray: NDArray, samples_px: NDArray, illumination: Array) -> Array:
+def cell_values(gray: Image, samples_px: Places, of_gray: Array = AS_GRAY) -> Array:
+    """Return the 48 cell means (Q, 48), black level removed, of patterns sampled at ``SAMPLES`` (Q, S, 2).
+
+    Of what ``of_gray`` (256,) makes of each gray value.
+    """
+    return _cells(gray, of_gray, np.ascontiguousarray(samples_px), _ILLUMINATION)
+
+
+@compiled(GRAY, VECTOR, PLACES_OF_MANY, MATRIX)
+def _cells(gray: Image, of_gray: Array, samples_px: NDArray, illumination: Array) -> Array:
     """Return cells (Q, 48) of patterns sampled at cells, and where they are black, (Q, S, 2).
 
     Each black sample adds a row of ``illumination`` (B, 48) to the black level at the cells.
@@ -311,7 +329,8 @@ def _cells(gray: NDArray, samples_px: NDArray, illumination: Array) -> Array:
     values = np.empty(samples_px.shape[1])
     for q in range(len(cells)):
         for s in range(len(values)):
-            values[s] = bilinear(gray, samples_px[q, s, 0], samples_px[q, s, 1])
+            x, y = samples_px[q, s, 0], samples_px[q, s, 1]
+            values[s] = light_between(gray, of_gray, x, y) * fading(x, y, gray.shape[0], gray.shape[1])
         for c in range(CELLS):
             cells[q, c] = values[c * SAMPLES_A_CELL : (c + 1) * SAMPLES_A_CELL].mean()
         for b in range(len(illumination)):
@@ -320,9 +339,9 @@ def _cells(gray: NDArray, samples_px: NDArray, illumination: Array) -> Array:
     return cells
 
 
-def layer_cells(gray: Brightness, warp: Warp, layer: int) -> Array:
+def layer_cells(light: Light, warp: Warp, layer: int) -> Array:
     """Return the cells (48,) of one layer of a marker whose print is warped into the image."""
-    return cell_values(gray, warp(_LAYER_SAMPLES[layer])[None])[0]
+    return cell_values(light.gray, warp(_LAYER_SAMPLES[layer])[None], light.of_gray)[0]
 
 
 class Artwork:
