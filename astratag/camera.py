@@ -143,7 +143,7 @@ class Camera:
         """Return where pixels (N, 2) would be without distortion, in normalised coordinates x/z, y/z (N, 2)."""
         points = np.ascontiguousarray(points_px, dtype=float).reshape(-1, 1, 2)
         if not (self.distortion.any() and len(points)):
-            return (points.reshape(-1, 2) - self.K[:2, 2]) @ np.linalg.inv(self.K[:2, :2]).T
+            return (points.reshape(-1, 2) - self.K[:2, 2]) / self.K.diagonal()[:2]
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-12)
         return cv2.undistortPoints(points, self.K, self.distortion, criteria=criteria).reshape(-1, 2)
 
