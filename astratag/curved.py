@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +15,7 @@ from astratag.candidates import FRAME, OUTER, Candidate, darker_inside
 from astratag.codes import Reading
 from astratag.codes.acceptance import chance_of_correlation
 from astratag.codes.soft import correlations, hamming
+from astratag.compiled import INDICES, MATRIX, REAL, compiled
 from astratag.cylinder import Bent, CylinderWarp, bent_through
 from astratag.detection import LayerDetection
 from astratag.fit import fit_edges
@@ -26,7 +27,8 @@ from astratag.geometry import (
 )
 from astratag.grow import ALL_EDGES, Fit, Light, layer_side_px, settle
 from astratag.neighbours import Crossings
-from astratag.search import Contour, Outlines, starts_of
+from astratag.polygons import simplified
+from astratag.search import Outlines
 from astratag.signature import SAMPLES, Artwork, Codebook, Warp, cell_values, layer_cells, sample, unit
 from astratag.warp import OUTSIDE_PX, FittedWarp
 
@@ -85,41 +87,54 @@ def near_sides(outlines: Outlines) -> Array:
     The far side of a print may lie at the limb, or its ink run into what is dark behind it.  Both corners of the near
     side are seen, and how the sides beside it begin.
     """
-    contours = [contour for contour in outlines.others if len(contour) >= 4]
-    if not contours:
-        return np.zeros((0, 2, 2))
-    points, starts = np.concatenate(contours)[:, 0], starts_of(contours)
-    extent = np.maximum.reduceat(points, starts) - np.minimum.reduceat(points, starts)
-    large = np.flatnonzero(extent.max(axis=1) >= LEAST_NEAR_PX / outlines.scale)
-    polygons = [cv2.approxPolyDP(contours[i], NEAR_TOLERANCE_PX / outlines.scale, True)[::-1] for i in large]
-    sides = _near_sides([polygon for polygon in polygons if len(polygon) >= 4], outlines.scale)
-    return outlines.in_image(sides)
-
-
-def _near_sides(polygons: Sequence[Contour], scale: float) -> Array:
-    """Return the long sides (Q, 2, 2) of clockwise polygons (N, 1, 2) that lie between two corners, the longest first.
-
-    ``scale`` is how many pixels of the image theirs are wide.
-    """
-    if not polygons:
-        return np.zeros((0, 2, 2))
-    starts, at = starts_of(polygons), np.concatenate(polygons)[:, 0].astype(float)
-    next_one, last_one = np.arange(len(at)) + 1, np.arange(len(at)) - 1
-    ends = np.append(starts[1:], len(at)) - 1
-    next_one[ends], last_one[starts] = starts, ends
-    ahead = at[next_one] - at
-    length = np.maximum(np.sqrt((ahead * ahead).sum(axis=1)), 1e-9)
-    along = ahead / length[:, None]
-    before, after = along[last_one], along[next_one]
-    turn = np.arctan2(before[:, 0] * along[:, 1] - before[:, 1] * along[:, 0], (before * along).sum(axis=1))
-    corner = (turn > LEAST_TURN_RAD) & (turn < np.pi - LEAST_TURN_RAD)
-    beside = scale * np.minimum(length[last_one], length[next_one])
-    alike = -(before * after).sum(axis=1) > LEAST_ALIKE
-    use = corner & corner[next_one] & (scale * length >= LEAST_NEAR_PX) & (beside >= LEAST_BESIDE_PX) & alike
-    longest = np.flatnonzero(use)[np.argsort(-length[use], kind="stable")[:MAX_NEAR]]
+    others, scale = outlines.others, outlines.scale
+    sides, lengths = _near_sides(
+        others.points, others.starts, NEAR_TOLERANCE_PX / scale, LEAST_NEAR_PX / scale, LEAST_BESIDE_PX / scale
+    )
+    longest = np.argsort(-lengths, kind="stable")[:MAX_NEAR]
+    along = (sides[longest, 1] - sides[longest, 0]) / lengths[longest, None]
     outward = np.stack([along[:, 1], -along[:, 0]], axis=1)
     outset = NEAR_OUTSET_PX / scale * np.stack([outward - along, outward + along], axis=1)
-    return (np.stack([at, at[next_one]], axis=1) + outset)[longest]
+    return outlines.in_image(sides[longest] + outset)
+
+
+@compiled(MATRIX, INDICES, REAL, REAL, REAL)
+def _near_sides(
+    points: Array, starts: NDArray[np.int64], tolerance: float, least_near: float, least_beside: float
+) -> tuple[Array, Array]:
+    """Return sides (Q, 2, 2) of contours, simplified, that lie between two corners, and how long they are (Q,).
+
+    Contour i runs counter-clockwise in the image through ``points`` (P, 2) from ``starts`` (N + 1,) i on.
+    """
+    sides, lengths, found = np.empty((len(points), 2, 2)), np.empty(len(points)), 0
+    for i in range(len(starts) - 1):
+        contour = points[starts[i] : starts[i + 1]]
+        if max(np.ptp(contour[:, 0]), np.ptp(contour[:, 1])) < least_near:
+            continue
+        polygon = simplified(contour, tolerance)[::-1]
+        count = len(polygon)
+        if count < 4:
+            continue
+        turn, length, along = np.empty(count), np.empty(count), np.empty((count, 2))
+        for k in range(count):
+            ahead = polygon[(k + 1) % count] - polygon[k]
+            length[k] = max(math.hypot(ahead[0], ahead[1]), 1e-9)
+            along[k] = ahead / length[k]
+        for k in range(count):
+            before = along[k - 1]
+            turn[k] = math.atan2(
+                before[0] * along[k, 1] - before[1] * along[k, 0], before[0] * along[k, 0] + before[1] * along[k, 1]
+            )
+        for k in range(count):
+            last, following = (k - 1) % count, (k + 1) % count
+            corners = min(turn[k], turn[following]) > LEAST_TURN_RAD
+            corners &= max(turn[k], turn[following]) < np.pi - LEAST_TURN_RAD
+            beside = min(length[last], length[following])
+            alike = -(along[last, 0] * along[following, 0] + along[last, 1] * along[following, 1])
+            if corners and length[k] >= least_near and beside >= least_beside and alike > LEAST_ALIKE:
+                sides[found, 0], sides[found, 1], lengths[found] = polygon[k], polygon[following], length[k]
+                found += 1
+    return sides[:found].copy(), lengths[:found].copy()
 
 
 def curved_candidates(gray: Image, bent: Bent, codebook: Codebook, artwork: Artwork) -> list[Candidate]:

@@ -307,8 +307,8 @@ def _outlines(view: View, how: Binarisation) -> Outlines:
     if how.scale not in view.scaled:
         view.scaled[how.scale] = scaled(view.gray, how.scale)
     found = find_outlines(view.gray, how, view.scaled[how.scale])
-    points = COST.contour_point * sum(map(len, found.others))
-    view.outlines[how] = found if view.effort.spend(points + COST.outline * len(found.contours)) else NONE
+    points = COST.contour_point * found.followed
+    view.outlines[how] = found if view.effort.spend(points + COST.outline * found.contours.count) else NONE
     return view.outlines[how]
 
 
