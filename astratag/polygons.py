@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 
 TOLERANCES_A_SIDE = 5.0
 """How many times the tolerance the shortest side must be, or corners are moved by too much of it."""
+MOST_POINTS = 12
+"""Contours that take more points than this, before those on nearly straight lines are left out, are no quads."""
 FARTHEST_ROUNDS = 3
 """How often the point farthest from the one before is looked for, to find two that are far apart."""
 
@@ -75,9 +77,11 @@ def _cleaned(polygon: Array, count: int, squared: float) -> Array:
     return kept[:left].copy()
 
 
-@compiled(MATRIX, REAL)
-def simplified(contour: Array, tolerance: float) -> Array:
+@compiled(MATRIX, REAL, INT)
+def simplified(contour: Array, tolerance: float, most: int) -> Array:
     """Return the polygon (M, 2) that a closed contour (N, 2) stays within a tolerance of.
+
+    One that takes more than ``most`` points is given up: what comes back has more than a few, and means nothing.
 
     Ramer, "An iterative procedure for the polygonal approximation of plane curves", 1972; Douglas and Peucker, 1973.
     Begun, ordered and cleaned of points on nearly straight lines as OpenCV's ``approxPolyDP`` does.
@@ -113,6 +117,8 @@ def simplified(contour: Array, tolerance: float) -> Array:
         if off * off <= squared * (dx * dx + dy * dy):
             polygon[size, 0], polygon[size, 1] = x, y
             size += 1
+            if size > most:
+                return polygon[:size].copy()
         else:
             stack[top, 0], stack[top, 1], stack[top + 1, 0], stack[top + 1, 1] = at, end, begin, at
             top += 2
@@ -163,9 +169,15 @@ def _length(polygon: Array) -> float:
 @compiled(MATRIX, REAL, VECTOR, BOOL)
 def _convex_quad(contour: Array, perimeter: float, tolerances: Array, whole: bool) -> Array:
     """Return the convex quad (4, 2) that a contour (N, 2) simplifies to, else an empty one (0, 2); see below."""
-    best, finest = np.empty((0, 2)), np.inf
+    best, finest, too_fine, too_coarse = np.empty((0, 2)), np.inf, 0.0, np.inf
     for tolerance in tolerances:
-        polygon = simplified(contour, tolerance * perimeter)
+        if not too_fine < tolerance < too_coarse:
+            continue
+        polygon = simplified(contour, tolerance * perimeter, MOST_POINTS)
+        if len(polygon) > MOST_POINTS:
+            too_fine = tolerance
+        elif len(polygon) < 4:
+            too_coarse = tolerance
         if len(polygon) != 4 or not _convex(polygon):
             continue
         bearable = whole or _shortest(polygon) >= TOLERANCES_A_SIDE * tolerance * perimeter
@@ -258,7 +270,7 @@ def bent_quads(
     found, corners, bulges = np.zeros(count, dtype=np.bool_), np.zeros((count, 4, 2)), np.zeros((count, 4, 2))
     for i in range(count):
         contour = points[starts[i] : starts[i + 1]]
-        polygon = simplified(contour, tolerance * perimeters[i])[::-1].copy()
+        polygon = simplified(contour, tolerance * perimeters[i], 2 * most_vertices)[::-1].copy()
         if not 4 <= len(polygon) <= most_vertices:
             continue
         turns = _turns(polygon)

@@ -306,7 +306,7 @@ def _cut(outlines: Outlines) -> NDArray[np.bool_]:
 
 def _uncut(contour: Array, perimeter: float, size: tuple[int, int]) -> Array | None:
     """Return the convex quad (4, 2) that the border of an image of a size cut corners off; None if it cut none."""
-    polygon = simplified(hull(contour), BENT_TOLERANCE * perimeter)
+    polygon = simplified(hull(contour), BENT_TOLERANCE * perimeter, MAX_VERTICES)
     after = np.roll(polygon, -1, axis=0)
     near_low = np.maximum(polygon, after) <= BORDER_PX
     near_high = np.minimum(polygon, after) >= np.array(size) - 1 - BORDER_PX

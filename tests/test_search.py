@@ -18,7 +18,7 @@ from astratag.candidates import Candidate
 from astratag.codes import Reading
 from astratag.describe import outer_corners
 from astratag.detector import MAX_MATCHED
-from astratag.effort import Effort, Tries, first_distinct
+from astratag.effort import BETTER, Effort, Tries, first_distinct
 from astratag.geometry import LAYERS, TEMPLATE_UNITS, square
 from astratag.polygons import hull, simplified
 from astratag.search import (
@@ -155,7 +155,8 @@ def test_contours_simplify_as_by_opencv():
     outlines = find_outlines(adversarial("blobs")).contours
     alike = [
         np.array_equal(
-            simplified(contour, t * length), cv2.approxPolyDP(contour.astype(np.int32)[:, None], t * length, True)[:, 0]
+            simplified(contour, t * length, len(contour)),
+            cv2.approxPolyDP(contour.astype(np.int32)[:, None], t * length, True)[:, 0],
         )
         for length, contour in zip(outlines.perimeters, map(outlines.contour, range(outlines.count)), strict=True)
         for t in POLYGON_TOLERANCES
@@ -205,7 +206,8 @@ def test_a_square_is_tried_again_only_if_it_reads_better_and_never_more_than_so_
     tries = Tries(3)
     assert tries.take(first) and not tries.take(first)
     assert not tries.take(replace(first, corners_px=corners + 0.1))
-    assert tries.take(replace(first, reading=Reading(3, 0, 0.71, 2)))
+    assert not tries.take(replace(first, reading=Reading(3, 0, 0.7 + 0.9 * BETTER, 2)))
+    assert tries.take(replace(first, reading=Reading(3, 0, 0.7 + 1.1 * BETTER, 2)))
     assert tries.take(replace(first, reading=Reading(4, 0, 0.6, 2)))
     assert not tries.take(replace(first, corners_px=corners + 50.0))
     assert len(tries.made) == 3
