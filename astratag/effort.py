@@ -17,9 +17,10 @@ SAME_SQUARE = 0.04
 
 BETTER = 0.03
 """A square that was looked at is looked at again where it reads so much better."""
-LEAST_UNITS, UNITS_A_PIXEL = 12_000, 0.036
-"""What one image is worth whatever its size, and more for each pixel: about ten times what a plain one with a marker
-takes.
+LEAST_UNITS, UNITS_A_PIXEL, MOST_UNITS = 12_000, 0.048, 34_000
+"""What one image is worth whatever its size, and more for each pixel, up to a limit: ten times what a plain one with a
+marker takes, which is found in a large one at half its resolution.  The hardest markers of the benchmark, at 640x480,
+take 26 000.
 
 A unit is what takes about a microsecond, counted and never measured, so that the same image always gets the same.
 """
@@ -29,7 +30,7 @@ class Effort:
     """How many units of effort an image is worth, and how many were spent on it."""
 
     def __init__(self, pixels: int) -> None:
-        self.most = LEAST_UNITS + UNITS_A_PIXEL * pixels
+        self.most = min(LEAST_UNITS + UNITS_A_PIXEL * pixels, MOST_UNITS)
         self.spent = 0.0
 
     def spend(self, units: float) -> bool:
