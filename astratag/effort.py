@@ -60,16 +60,16 @@ class Costs:
     outline: float = 8.0
     """Simplified, and read as if flat."""
     edges: float = 700.0
-    aligned: float = 1500.0
+    aligned: float = 1200.0
     bent: float = 1.0
     """A bent square whose frame is looked at."""
     bent_read: float = 600.0
     """Those that have one, and how the best look."""
-    curved: float = 2500.0
+    curved: float = 1500.0
     relit: float = 15.0
     """An outline read cell by cell."""
     by_pixels: float = 150.0
-    matched: float = 5000.0
+    matched: float = 3500.0
     spline: float = 350.0
 
 
