@@ -74,9 +74,12 @@ EVERY_WAY = (PLAIN, NARROW, FAINT)
 """Ways of telling ink from paper in which listed markers are looked for that were not found at once."""
 COVER_REACH_PX = 30_000
 """OpenCV draws no further."""
-MAX_READ_BY_PIXELS, MAX_MATCHED = 12, 5
-"""Squares in one image that are read by all their pixels; and that are aligned with a print."""
-LEAST_CLOSE_PX = 16.0
+MAX_READ_BY_PIXELS, MAX_MATCHED = 12, 2
+"""Squares in one image that are read by all their pixels; and that are aligned with a print.
+
+Of 58 markers found so each was the first to be aligned.
+"""
+LEAST_CLOSE_PX = 18.0
 """Flat squares smaller than this are left to their pixels.
 
 Of 300 markers found by their edges or an alignment the smallest square was 19 pixels wide; what chance makes read like
@@ -239,7 +242,7 @@ class Detector(Confirmer):
         Those in uneven light are read cell by cell; and bent squares that none was found through by then.
         """
         tried, left = np.zeros((0, 4, 2)), MAX_MATCHED
-        for how in (TINY, BROAD, SLANTED, THIN, STEEP):
+        for how in (TINY, SLANTED, BROAD, STEEP):
             quads = quads_of(_outlines(view, how))
             found = self._search_relit(view, quads)
             if found:
@@ -304,8 +307,8 @@ def _outlines(view: View, how: Binarisation) -> Outlines:
     if how.scale not in view.scaled:
         view.scaled[how.scale] = scaled(view.gray, how.scale)
     found = find_outlines(view.gray, how, view.scaled[how.scale])
-    points = COST.contour_point * sum(map(len, found.others))
-    view.outlines[how] = found if view.effort.spend(points + COST.outline * len(found.contours)) else NONE
+    borders = COST.border_pixel * found.followed
+    view.outlines[how] = found if view.effort.spend(borders + COST.outline * found.contours.count) else NONE
     return view.outlines[how]
 
 

@@ -19,7 +19,7 @@ from astratag.search import Binarisation, Outlines, Scaled
 
 Array = NDArray[np.float64]
 
-MAX_BY_EDGES, MAX_ALIGNED, MAX_CURVED = 12, 5, 6
+MAX_BY_EDGES, MAX_ALIGNED, MAX_CURVED = 8, 4, 6
 """Candidates in one image whose edges are fitted; that are moved until they look as they read; and so on cylinders."""
 
 
