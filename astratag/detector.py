@@ -218,8 +218,10 @@ class Detector(Confirmer):
         """Return the markers bent about cylinders so much, or so far turned, that none was found otherwise."""
         if not self._bends:
             return []
-        beside = bent_beside(view.some_camera, near_sides(_outlines(view, NARROW)))
-        return self._search_bent(view, _outlines(view, THIN)) or self._search_curved(view, beside)
+        found, outlines = self._search_bent(view, _outlines(view, THIN)), _outlines(view, NARROW)
+        if found or not view.effort.spend(COST.border_pixel * outlines.followed):
+            return found
+        return self._search_curved(view, bent_beside(view.some_camera, near_sides(outlines)))
 
     def _search_by_spline(self, view: View) -> list[Detection]:
         """Return the markers on surfaces that no cylinder explains."""

@@ -56,11 +56,11 @@ class Costs:
     resized_pixel: float = 0.0005
     """More of the whole picture, at the resolution worked at."""
     border_pixel: float = 0.03
-    """Of the borders of all shapes."""
-    outline: float = 8.0
+    """Of the borders of all shapes: followed, or looked through for near sides."""
+    outline: float = 10.0
     """Simplified, and read as if flat."""
     edges: float = 700.0
-    aligned: float = 1200.0
+    aligned: float = 1400.0
     bent: float = 1.0
     """A bent square whose frame is looked at."""
     bent_read: float = 600.0

@@ -18,7 +18,7 @@ from astratag.candidates import Candidate
 from astratag.codes import Reading
 from astratag.describe import outer_corners
 from astratag.detector import MAX_MATCHED
-from astratag.effort import BETTER, Effort, Tries, first_distinct
+from astratag.effort import BETTER, LEAST_UNITS, MOST_UNITS, UNITS_A_PIXEL, Effort, Tries, first_distinct
 from astratag.geometry import LAYERS, TEMPLATE_UNITS, square
 from astratag.polygons import hull, simplified
 from astratag.search import (
@@ -283,6 +283,16 @@ def test_what_is_done_ends_with_the_effort_an_image_is_worth(kind, monkeypatch):
         calls.append(counts)
     assert calls[0]["find_outlines"] == calls[0]["curved_candidates"] == 0
     assert calls[0]["find_outlines"] <= calls[1]["find_outlines"] <= calls[2]["find_outlines"]
+
+
+@pytest.mark.parametrize("size", [(320, 240), (640, 480), (1280, 720)])
+@pytest.mark.parametrize("kind", ["noise", "blobs", "board", "JPEG", "squares"])
+def test_no_image_of_any_size_is_worth_more_than_so_many_units(kind, size):
+    image = np.tile(adversarial(kind), (3, 4))[: size[1], : size[0]]
+    detector = Detector()
+    view = detector.view(image, None)
+    assert detector.find(view) == []
+    assert view.effort.spent <= view.effort.most <= min(LEAST_UNITS + UNITS_A_PIXEL * image.size, MOST_UNITS)
 
 
 def test_effort_is_never_overspent():
