@@ -128,8 +128,9 @@ class Describer:
         layers: tuple[LayerDetection, ...],
         method: str,
         covariance: Array | None = None,
+        planar: tuple[PlanarPose, ...] = (),
     ) -> Detection:
-        """Return a detection; ``covariance`` is of a warp that is a pose."""
+        """Return a detection; ``covariance`` is of a warp that is a pose, ``planar`` both poses if known."""
         spec = self.spec(reading.marker_id)
         seen_from = warp.pose if isinstance(warp, CylinderWarp) else warp
         surface = seen_from.surface if isinstance(seen_from, PoseWarp) else spec.surface or Flat()
@@ -139,10 +140,11 @@ class Describer:
         poses: tuple[PlanarPose, ...] = ()
         if view.camera is not None:
             fitted = seen_from.T_cam_marker if isinstance(seen_from, PoseWarp) else None
-            poses = planar_poses(view.camera, layers, spec.side_m, surface, fitted)
+            poses = planar or planar_poses(view.camera, layers, spec.side_m, surface, fitted)
             if isinstance(seen_from, PoseWarp):
                 T_cam_marker = seen_from.T_cam_marker
-                rms_px = next((pose.reprojection_rms_px for pose in poses if pose.T_cam_marker is fitted), None)
+                exact = 0.0 if planar else None  # by pixels, corners are where the pose has them
+                rms_px = next((pose.reprojection_rms_px for pose in poses if pose.T_cam_marker is fitted), exact)
             elif poses:
                 start = PoseWarp(view.camera, spec.side_m, surface, poses[0].T_cam_marker)
                 T_cam_marker, covariance, rms_px = refine_on_corners(start, layers)
@@ -175,20 +177,33 @@ class Describer:
         return self._described_by_pixels(view, marker_id, aligned, 0, float(scores[row, 0]), method)
 
     def _described_by_pixels(
-        self, view: View, marker_id: int, aligned: Alignment, layer: int, correlation: float, method: str
+        self,
+        view: View,
+        marker_id: int,
+        aligned: Alignment,
+        layer: int,
+        correlation: float,
+        method: str,
+        before: Detection | None = None,
     ) -> Detection | None:
-        """Return the detection an alignment amounts to: one layer, whose corners stand for all pixels of the print."""
+        """Return the detection an alignment amounts to: one layer, whose corners stand for all pixels of the print.
+
+        What was read, and both planar poses, are those of the detection ``before`` it where there is one.
+        """
         square_px = aligned.warp(SQUARES[layer])
         if not inside(square_px, view.gray.shape):
             return None
-        wrong = self._codebook.read_as(layer_cells(view.light, aligned.warp, layer), marker_id).hamming
-        if self._codebook.tau_hamming is not None and wrong > self._codebook.tau_hamming:
-            return None
+        if before is None or self._codebook.tau_hamming is not None:
+            wrong = self._codebook.read_as(layer_cells(view.light, aligned.warp, layer), marker_id).hamming
+            if self._codebook.tau_hamming is not None and wrong > self._codebook.tau_hamming:
+                return None
+        wrong, cells = (wrong, INDEPENDENT_CELLS) if before is None else (before.hamming, before.cells)
         layers = (LayerDetection(layer, square_px, aligned.sigma_px(SQUARES[layer])),)
         is_pose = isinstance(aligned.warp, PoseWarp | CylinderWarp)
         covariance = aligned.cautious_covariance[:6, :6] if is_pose else None
-        reading = Reading(marker_id, 0, correlation, wrong, cells=INDEPENDENT_CELLS)
-        return self._described(view, reading, aligned.warp, layers, method, covariance)
+        reading = Reading(marker_id, 0, correlation, wrong, cells=cells)
+        planar = before.planar_poses if before is not None and is_pose else ()
+        return self._described(view, reading, aligned.warp, layers, method, covariance, planar)
 
     def polished(self, view: View, detection: Detection, below_px: float = POLISHED_PX) -> Detection:
         """Return a detection measured again by all its pixels when it looks small: from each pose its corners allow."""
@@ -211,11 +226,11 @@ class Describer:
         best = max((one for one in aligned if one is not None), key=lambda one: one.correlation, default=None)
         if best is None or best.correlation < LEAST_POLISHED:
             return detection
-        again = self._described_by_pixels(view, detection.marker_id, best, 0, detection.correlation, detection.method)
+        marker_id, read, method = detection.marker_id, detection.correlation, detection.method
+        again = self._described_by_pixels(view, marker_id, best, 0, read, method, detection)
         if again is None:
             return detection
-        both = detection.planar_poses or again.planar_poses
-        return replace(again, planar_poses=both, hamming=detection.hamming, cells=detection.cells)
+        return replace(again, planar_poses=detection.planar_poses or again.planar_poses)
 
     def with_other_pose(self, view: View, detection: Detection, fit: Fit) -> Detection:
         """Return the detection fitted from the other planar pose when corners allow both and the edges prefer it."""
