@@ -42,7 +42,7 @@ LEAST_SIDE_PX = 24.0
 PROMISING, MAX_CANDIDATES, MAX_READ, MAX_GLANCED_AT = 0.44, 4, 20, 200
 """Correlation from which a bent square is worth a look; at most so many are moved, of so many read.
 
-Of so many whose cells are glanced at, the likeliest: of 100 bent prints that were found, all were among the first 3.
+Of so many whose cells are glanced at, the likeliest: of 56 bent prints that were found, all were among the first 3.
 """
 MAX_LOOKED_AT, SHARE_OF_LOOKS, WORTH_MOVING = 10, 0.25, 0.62
 """Squares that are looked at; and what their correlation, and this share of how they look, must come to.
