@@ -50,8 +50,12 @@ PIXEL_BLUR = 0.95
 """Blur from which squares are matched, pixels: a good lens's, and what sampling between pixels adds."""
 POLISHED_TO_PX = 0.08
 """The step after one that moved a print by less would move it by a hundredth of a pixel."""
-POLISHED_PX, LEAST_POLISHED = 90.0, 0.95
-"""Markers that look smaller than this are measured by all their pixels, not by their edges, where these look right."""
+FOUND_PX, POLISHED_PX, LEAST_POLISHED = 56.0, 90.0, 0.95
+"""Markers that look smaller are measured by all their pixels, not by their edges, where these look right.
+
+At 32 to 48 pixels corners are twice as exact so, at 60 by a half, at 85 by a tenth.  What was just found is measured so
+only where that is worth most, for it takes as long again as finding it; what is tracked, up to the larger size.
+"""
 CELLS_WITHIN = np.array([layer_points(square(BORDER_UNITS, TEMPLATE_UNITS - BORDER_UNITS), layer) for layer in LAYERS])
 CELLS_WITHIN.flags.writeable = False
 """The corners (3, 4, 2) of the squares that hold the layers' cells, template units."""
@@ -205,7 +209,7 @@ class Describer:
         planar = before.planar_poses if before is not None and is_pose else ()
         return self._described(view, reading, aligned.warp, layers, method, covariance, planar)
 
-    def polished(self, view: View, detection: Detection, below_px: float = POLISHED_PX) -> Detection:
+    def polished(self, view: View, detection: Detection, below_px: float) -> Detection:
         """Return a detection measured again by all its pixels when it looks small: from each pose its corners allow."""
         if detection.method in ("tps", "cylinder") and self.spec(detection.marker_id).surface is None:
             return detection

@@ -132,7 +132,7 @@ class Tracker:
             if fit is not None and fit.cost < COST_LIMIT:
                 detection = self.detector.describe(view, track.marker_id, fit, "tracked")
                 if detection is not None:
-                    return self.detector.polished(view, self._unmirrored(view, detection, fit))
+                    return self.detector.polished(view, self._unmirrored(view, detection, fit), POLISHED_PX)
         return self._match_near(view, track)
 
     def _unmirrored(self, view: View, detection: Detection, fit: Fit) -> Detection:
