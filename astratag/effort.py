@@ -17,10 +17,9 @@ SAME_SQUARE = 0.04
 
 BETTER = 0.03
 """A square that was looked at is looked at again where it reads so much better."""
-LEAST_UNITS, UNITS_A_PIXEL, MOST_UNITS = 12_000, 0.06, 34_000
-"""What one image is worth whatever its size, and more for each pixel, up to a limit: some ten times what a plain one
-with a marker takes, which is found in a large one at half its resolution.  At 640x480 the hardest markers of the
-benchmark take 26 000 on known surfaces; at 83 degrees on unknown ones up to 29 000, which is more than that is worth.
+LEAST_UNITS, UNITS_A_PIXEL, MOST_UNITS = 12_000, 0.065, 34_000
+"""What one image is worth whatever its size, and more for each pixel, up to a limit: what the hardest markers of the
+benchmark take, which at 640x480 is 31 000.  A plain one with a marker takes a tenth to a twentieth of it.
 
 A unit is what takes about a microsecond, counted and never measured, so that the same image always gets the same.
 """
