@@ -13,7 +13,7 @@ from astratag.geometry import LAYERS, square
 from astratag.transforms import difference, exp_so3, pose
 from astratag.warp import PoseWarp
 from benchmarks.detection.peers import texture
-from benchmarks.detection.scenes import SIDE_M, LightChange, Scene, covered, draw, glare, shadow
+from benchmarks.detection.scenes import CONDITIONS, SIDE_M, LightChange, Scene, covered, draw, glare, shadow
 from pipeline.render import render_marker
 
 DICTIONARY = load_dictionary()
@@ -147,6 +147,20 @@ def test_a_cylinder_of_radius_1_5_sides_leaned_is_read(tilt_deg: float, known: b
     for seed, azimuth in enumerate((0.0, np.pi)):
         T = hard(160, tilt_deg, azimuth + np.pi / 2 + CYLINDER.axis_rad, roll_rad=1.1)
         assert_seen_right(photograph(T, CYLINDER, seed=seed), T, CYLINDER, known)
+
+
+@pytest.mark.parametrize(
+    ("condition", "turn_deg", "seed"), [("turn", 60, 6000021), ("turn", 60, 6000076), ("tight", 50, 6000004)]
+)
+def test_an_inner_layer_that_looks_flat_does_not_make_the_whole_print_flat(
+    condition: str, turn_deg: float, seed: int
+) -> None:
+    """On a cylinder that nobody told of: corners of the outer square were ten pixels off."""
+    scene = next(one for one in CONDITIONS if one.name == condition).scene(turn_deg)
+    drawn = draw(scene, seed)
+    seen = one(Detector(side_m=SIDE_M).detect(drawn.photograph(TEXTURE), drawn.camera))
+    warp = PoseWarp(drawn.camera, SIDE_M, drawn.surface, drawn.T_cam_print)
+    assert np.abs(seen.corners_px - warp(square(0.0, 700.0))).max() < 3.0
 
 
 def test_a_contrast_of_15_grey_levels_is_enough() -> None:
