@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.convert import NS_PER_S
-from pipeline.corner_filter import CornerFilter, Eye, SeenLayer, predicted_corners
+from pipeline.corner_filter import CornerFilter
+from pipeline.corners import Eye, SeenLayer, predicted_corners
 from pipeline.dynamics import Motion
 from pipeline.mission import FilterSection
 

@@ -12,7 +12,7 @@ from astratag.detection import LayerDetection
 from astratag.pose import planar_poses
 from astratag.transforms import exp_so3, pose
 from pipeline.convert import calibration_message, points_message, pose_message
-from pipeline.corner_filter import outward_shift
+from pipeline.corners import SeenLayer, corner_noise, outward_shift
 from pipeline.expected import visible_layers
 from pipeline.mapping.bundle import BIAS_DOF
 from pipeline.mapping.estimate import pose_section
@@ -68,7 +68,7 @@ def seen_from(
     bias_px: Mapping[int, Array] | None = None,
     only: set[int] | None = None,
 ) -> Detections:
-    """Return one frame's detections with Gaussian corner noise.
+    """Return one frame's detections with the noise of lines along edges, as the mission's filter has it.
 
     ``bias_px`` (11,) is how far a marker's corners are measured beside their place, as in ``Corners.by_bias``.
     """
@@ -80,7 +80,9 @@ def seen_from(
         bias = (bias_px or {}).get(expected.marker_id, np.zeros(BIAS_DOF))
         outward_px = bias[0] * outward_shift(expected.corners_px[None])[0]
         biased_px = expected.corners_px + outward_px + bias[1:3] + bias[3:].reshape(4, 2)
-        corners_px = biased_px + sigma_px * rng.standard_normal((4, 2))
+        exact = SeenLayer(expected.marker_id, expected.layer, expected.corners_px, sigma_px, np.zeros((4, 3)))
+        root = np.linalg.cholesky(corner_noise([exact], mission.filter))
+        corners_px = biased_px + (root @ rng.standard_normal(8)).reshape(4, 2)
         found.setdefault(expected.marker_id, []).append(LayerDetection(expected.layer, corners_px, sigma_px))
     return Detections(
         t_capture_ns=T0_NS + round(t_s * 1e9),

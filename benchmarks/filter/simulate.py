@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from astratag.transforms import difference, exp_so3, inverse, pose, skew
 from pipeline.bound import posterior_bounds
 from pipeline.convert import points_message, pose_matrix, pose_message, vector_array
-from pipeline.corner_filter import Eye, SeenLayer, outward_shift
-from pipeline.dynamics import POSITION, SPEEDS, STATES, Motion, process_noise
+from pipeline.corners import Eye, SeenLayer, corner_noise, outward_shift
+from pipeline.dynamics import ACCELERATION, POSITION, SPEEDS, STATES, Motion, lasting_push, process_noise
 from pipeline.mission import FilterSection, FlatSection, Mission
 from pipeline.pose_filter import PoseFilter, corners_on_target
 from pipeline.scenario import FACING
@@ -25,8 +25,8 @@ from tests.approach import CALIBRATION, CAMERA, MARKER, detections, mission, vis
 Array = NDArray[np.float64]
 SIGMA_PX = 0.15
 SETTLED_S = 2.0
-MATCHED = FilterSection(edge_bias_px=0.0, scale_sigma=0.0, picture_shift_px=0.0)
-"""A camera without fault."""
+MATCHED = FilterSection(edge_bias_px=0.0, corner_bias_px=0.0, scale_sigma=0.0, picture_shift_px=0.0, correlation_s=0.1)
+"""A camera without fault, and accelerations that are new with every other picture."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,8 @@ def motions(case: Case, mission_: Mission, rng: np.random.Generator) -> list[Mot
         for range_m in (case.ranges_m[0], case.ranges_m[-1])
     )
     to_go_s = dt_s * np.arange(count - 1, -1, -1)
-    drifted = shoves[:, POSITION].sum(axis=0) + to_go_s @ shoves[:, SPEEDS[:3]]
+    pushed_s2 = np.array([lasting_push(float(left_s), case.noise.correlation_s)[2] for left_s in to_go_s])
+    drifted = shoves[:, POSITION].sum(axis=0) + to_go_s @ shoves[:, SPEEDS[:3]] + pushed_s2 @ shoves[:, ACCELERATION]
     v = (last[:3, 3] - first[:3, 3] - drifted) / (dt_s * count)  # where the noise leads is where the marker is
     real = Motion(first[:3, 3], first[:3, :3], v, np.zeros(3))
     path = []
@@ -108,9 +109,12 @@ def look(
     if not layers:
         return None
     centre, seen = CAMERA.K[:2, 2], []
-    for layer, corners in layers.items():
+    exact = [SeenLayer(MARKER, layer, corners, SIGMA_PX, np.zeros((4, 3))) for layer, corners in layers.items()]
+    root = np.linalg.cholesky(corner_noise(exact, MATCHED))
+    noise_px = (root @ rng.standard_normal(len(root))).reshape(-1, 4, 2)
+    for (layer, corners), new_px in zip(layers.items(), noise_px, strict=True):
         wrong = case.focal_error * (corners - centre) + case.edge_px * outward_shift(corners[None])[0] + case.shift_px
-        noisy = corners + wrong + case.corner_px * offsets_px[layer] + SIGMA_PX * rng.standard_normal((4, 2))
+        noisy = corners + wrong + case.corner_px * offsets_px[layer] + new_px
         seen.append(LayerCorners(layer=layer, corners_px=points_message(noisy), sigma_px=SIGMA_PX))
     T_cam_marker = inverse(mission_.camera.T_chaser_cam.matrix()) @ T @ mission_.markers[0].T_target_marker.matrix()
     message = pose_message(T_cam_marker)

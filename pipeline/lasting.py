@@ -1,0 +1,96 @@
+"""How far the corners of each layer are off for long: what a detector makes of blur, neighbours and JPEG stays for a
+while, and is no smaller after many looks.
+
+Of each black square, by itself: how far all its edges lie outside their place, and beside that how far each corner is
+off, image axes.  Each is a first-order Gauss-Markov process (A. E. Bryson, Y.-C. Ho, "Applied optimal control", 1975),
+whose stationary spread and correlation time the mission has; it joins the filter's error state, behind the motion's,
+when the layer is first seen, and leaves it once the layer was away for so long that little of it is left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.mission import FilterSection
+
+Array = NDArray[np.float64]
+Key = tuple[int, int]
+"""Marker and layer."""
+
+OUTWARD, CORNERS = 0, slice(1, 9)
+PER_LAYER = 9
+
+
+@dataclass(frozen=True, eq=False)
+class LastingErrors:
+    """The estimate of every layer's lasting errors, px: outward, then the corners' coordinates in the marker's order.
+
+    Nothing is changed in place.
+    """
+
+    keys: tuple[Key, ...] = ()
+    px: Array = field(default_factory=lambda: np.zeros((0, PER_LAYER)))
+    """(L, 9)"""
+    unseen_s: tuple[float, ...] = ()
+    """For how long each layer was not measured."""
+
+    def moved(self, error_px: Array) -> LastingErrors:
+        """Return these with an error (9 L,) put in."""
+        return replace(self, px=self.px + error_px.reshape(-1, PER_LAYER))
+
+    def slots(self, keys: Iterable[Key]) -> list[int]:
+        """Return which of these layers' errors are."""
+        place = {key: k for k, key in enumerate(self.keys)}
+        return [place[key] for key in keys]
+
+    def with_new(self, keys: Sequence[Key]) -> LastingErrors:
+        """Return these and, behind them, those of layers that were not known, of which nothing is known."""
+        new = tuple(dict.fromkeys(key for key in keys if key not in self.keys))
+        if not new:
+            return self
+        px = np.vstack([self.px, np.zeros((len(new), PER_LAYER))])
+        return LastingErrors(self.keys + new, px, self.unseen_s + (0.0,) * len(new))
+
+    def seen(self, keys: Iterable[Key]) -> LastingErrors:
+        """Return the same after layers were measured."""
+        now = set(keys)
+        unseen_s = (0.0 if key in now else s for key, s in zip(self.keys, self.unseen_s, strict=True))
+        return replace(self, unseen_s=tuple(unseen_s))
+
+    def after(self, dt_s: float, noise: FilterSection) -> LastingErrors:
+        """Return what is left of them ``dt_s`` seconds later."""
+        return LastingErrors(self.keys, decay(dt_s, noise) * self.px, tuple(s + dt_s for s in self.unseen_s))
+
+    def kept(self, noise: FilterSection) -> list[int]:
+        """Return which of them were seen so lately that more is known of them than of new ones."""
+        longest_s = max(noise.edge_bias_correlation_s, noise.corner_bias_correlation_s)
+        return [k for k, s in enumerate(self.unseen_s) if s <= longest_s]
+
+    def only(self, chosen: Sequence[int]) -> LastingErrors:
+        """Return some of them."""
+        return LastingErrors(
+            tuple(self.keys[k] for k in chosen), self.px[list(chosen)], tuple(self.unseen_s[k] for k in chosen)
+        )
+
+
+def is_modelled(noise: FilterSection) -> bool:
+    """Tell whether a mission knows of any lasting errors."""
+    return noise.edge_bias_px > 0 or noise.corner_bias_px > 0
+
+
+def variances_px2(noise: FilterSection) -> Array:
+    """Return the stationary variances (9,) px^2 of a layer's lasting errors."""
+    variances = np.full(PER_LAYER, noise.corner_bias_px**2)
+    variances[OUTWARD] = noise.edge_bias_px**2
+    return variances
+
+
+def decay(dt_s: float, noise: FilterSection) -> Array:
+    """Return the shares (9,) of a layer's lasting errors that are left after ``dt_s`` seconds."""
+    shares = np.full(PER_LAYER, np.exp(-dt_s / noise.corner_bias_correlation_s))
+    shares[OUTWARD] = np.exp(-dt_s / noise.edge_bias_correlation_s)
+    return shares
