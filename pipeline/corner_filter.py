@@ -16,15 +16,16 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotrs, dtrtrs
 from scipy.stats import chi2
 
+from astratag.compiled import MATRIX, VECTOR, compiled
 from pipeline.corners import (
     CORNER_DOF,
     LINEAR_SHARE,
     Eye,
     SeenLayer,
     bending,
-    by_lasting,
     corner_noise,
     predicted_corners,
+    with_lasting,
 )
 from pipeline.dynamics import (
     ACCELERATION,
@@ -147,14 +148,10 @@ class CornerFilter:
             rows = np.concatenate([np.arange(STATES), *(_rows(k) for k in kept)])
             P, lasting = P[np.ix_(rows, rows)], lasting.only(kept)
         F, shares = self.motion.transition(dt_s, self.noise, own), decay(dt_s, self.noise)
-        left = np.tile(shares, len(kept))
-        later = np.empty_like(P)
-        later[:STATES, :STATES] = F @ P[:STATES, :STATES] @ F.T + process_noise(dt_s, self.noise)
-        later[:STATES, STATES:] = F @ P[:STATES, STATES:] * left
-        later[STATES:, :STATES] = later[:STATES, STATES:].T
-        later[STATES:, STATES:] = left[:, None] * P[STATES:, STATES:] * left
-        behind = np.arange(STATES, len(P))
-        later[behind, behind] += np.tile((1 - shares**2) * variances_px2(self.noise), len(kept))
+        left, added = np.ones(len(P)), np.zeros(len(P))
+        left[STATES:] = np.tile(shares, len(kept))
+        added[STATES:] = np.tile((1 - shares**2) * variances_px2(self.noise), len(kept))
+        later = _later(np.ascontiguousarray(P), F, process_noise(dt_s, self.noise), left, added)
         self._P, self.lasting = later, lasting.after(dt_s, self.noise)
         self.motion = self.motion.after(dt_s, self.noise, own)
 
@@ -242,12 +239,11 @@ class CornerFilter:
         if seen is None:
             return None
         observed = np.concatenate([layer.corners_px.ravel() for layer in layers])
-        H, residual_px = np.zeros((len(observed), len(self._P))), observed - seen[0]
-        H[:, :STATES] = seen[1]
+        H, residual_px = seen[1], observed - seen[0]
         if turned is not None:
             H[:, ATTITUDE] = H[:, ATTITUDE] @ turned
         if self.lasting.keys:
-            by_lasting(H, seen[0], self.lasting.slots(layer.key for layer in layers))
+            H = with_lasting(H, seen[0], self.lasting.slots(layer.key for layer in layers), len(self._P))
             residual_px -= H[:, STATES:] @ (self.lasting if lasting is None else lasting).px.ravel()
         PHt, R = self._P @ H.T, corner_noise(layers, self.noise)
         S = H @ PHt + R
@@ -326,6 +322,33 @@ class CornerFilter:
         P[POSITION] = R.T @ P[POSITION]
         P[:, POSITION] = P[:, POSITION] @ R
         return (P + P.T) / 2
+
+
+@compiled(MATRIX, MATRIX, MATRIX, VECTOR, VECTOR)
+def _later(P: Array, F: Array, Q: Array, left: Array, added: Array) -> Array:
+    """Return a covariance (N, N) later: by F and Q (21, 21) of the motion, by shares and variances (N,) of the rest."""
+    size = len(P)
+    half, later = np.empty((STATES, size)), np.empty((size, size))
+    for i in range(STATES):
+        half[i] = 0.0
+        for k in range(STATES):
+            if F[i, k] != 0.0:
+                for j in range(size):
+                    half[i, j] += F[i, k] * P[k, j]
+    for i in range(size):
+        for j in range(STATES, size):
+            later[i, j] = (half[i, j] if i < STATES else P[i, j] * left[i]) * left[j]
+        later[i, i] = later[i, i] + added[i] if i >= STATES else 0.0
+    for i in range(STATES):
+        for j in range(STATES):
+            total = Q[i, j]
+            for k in range(STATES):
+                if F[j, k] != 0.0:
+                    total += half[i, k] * F[j, k]
+            later[i, j] = total
+        for j in range(STATES, size):
+            later[j, i] = later[i, j]
+    return later
 
 
 def _rows(slot: int) -> NDArray[np.intp]:

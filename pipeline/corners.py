@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astratag.camera import Camera
-from astratag.compiled import CUBE, FLAGS, MATRIX, REAL, VECTOR, compiled
+from astratag.compiled import CUBE, FLAGS, INDICES, INT, MATRIX, REAL, VECTOR, compiled
 from pipeline.dynamics import ATTITUDE, POSITION, SCALE, SHIFT, STATES, Motion
-from pipeline.lasting import OUTWARD, PER_LAYER
+from pipeline.lasting import CORNERS, OUTWARD, PER_LAYER
 from pipeline.mission import FilterSection
 
 Array = NDArray[np.float64]
@@ -38,6 +38,7 @@ LEAST_ALONE = 0.01
 LASTING_LOOKS = 20
 """How many looks an error of the attitude lasts while it is large: 2 s of pictures, until others outweigh them."""
 FIRST_OF_POSITION, FIRST_OF_ATTITUDE, FIRST_OF_SHIFT = POSITION.start, ATTITUDE.start, SHIFT.start
+FIRST_OF_CORNERS = CORNERS.start
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,13 +114,23 @@ def corner_noise(layers: Sequence[SeenLayer], noise: FilterSection) -> Array:
     )
 
 
-def by_lasting(H: Array, predicted_px: Array, slots: Sequence[int]) -> None:
-    """Put into slopes (8 L, N) how corners predicted at (8 L,) px follow their layers' lasting errors."""
+def with_lasting(H: Array, predicted_px: Array, slots: Sequence[int], columns: int) -> Array:
+    """Return slopes (8 L, ``columns``): those by the motion (8 L, 21), and those by the layers' lasting errors."""
     outward = outward_shift(predicted_px.reshape(-1, 4, 2)).reshape(-1, CORNER_DOF)
-    for k, slot in enumerate(slots):
-        rows, first = np.arange(CORNER_DOF * k, CORNER_DOF * (k + 1)), STATES + PER_LAYER * slot
-        H[rows, first + OUTWARD] = outward[k]
-        H[rows, first + 1 + np.arange(CORNER_DOF)] = 1.0
+    return _with_lasting(H, outward, np.array(slots, dtype=np.int64), columns)
+
+
+@compiled(MATRIX, MATRIX, INDICES, INT)
+def _with_lasting(H: Array, outward: Array, slots: NDArray[np.int64], columns: int) -> Array:
+    whole = np.zeros((len(H), columns))
+    for row in range(len(H)):
+        layer, coordinate = row // CORNER_DOF, row % CORNER_DOF
+        for column in range(STATES):
+            whole[row, column] = H[row, column]
+        first = STATES + PER_LAYER * slots[layer]
+        whole[row, first + OUTWARD] = outward[layer, coordinate]
+        whole[row, first + FIRST_OF_CORNERS + coordinate] = 1.0
+    return whole
 
 
 def bending(motion: Motion, P_attitude: Array, layers: Sequence[SeenLayer], eye: Eye) -> Array | None:

@@ -11,6 +11,7 @@ performance for manned maneuvering targets", 1970.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,7 +159,7 @@ class Motion:
         jump = now.omega_hill_chaser_in_chaser_rad_s - before.omega_hill_chaser_in_chaser_rad_s
         return replace(
             self,
-            v_chaser_target_m_s=self.v_chaser_target_m_s - np.cross(jump, self.p_chaser_target_m),
+            v_chaser_target_m_s=self.v_chaser_target_m_s - skew(jump) @ self.p_chaser_target_m,
             omega_chaser_target_in_target_rad_s=self.omega_chaser_target_in_target_rad_s
             - self.R_chaser_target.T @ jump,
         )
@@ -198,7 +199,7 @@ def free_rotation(
 
 
 def _euler(omega: Array, inertia: Array) -> Array:
-    return -np.cross(omega, inertia * omega) / inertia
+    return -(skew(omega) @ (inertia * omega)) / inertia
 
 
 def _euler_slopes(omega: Array, inertia: Array) -> Array:
@@ -241,14 +242,21 @@ def process_noise(dt_s: float, noise: FilterSection) -> Array:
 
     The integral of R. A. Singer, 1970, eq. 11, by Gauss-Legendre: exact to 1e-12 up to a correlation time.
     """
+    return _process_noise(dt_s, noise.correlation_s, noise.acceleration_m_s2, noise.angular_acceleration_rad_s2)
+
+
+@lru_cache(maxsize=64)
+def _process_noise(dt_s: float, correlation_s: float, acceleration: float, angular_acceleration: float) -> Array:
+    """Return the same, shared and not to be written to: frames come at few different intervals."""
     ages_s, weights = dt_s / 2 * (1 + NODES), dt_s / 2 * WEIGHTS
-    pushes = np.array([lasting_push(float(age_s), noise.correlation_s)[::-1] for age_s in ages_s])
-    added = 2 / noise.correlation_s * (pushes.T * weights) @ pushes
-    variances = np.repeat(np.square((noise.acceleration_m_s2, noise.angular_acceleration_rad_s2)), 3)
+    pushes = np.array([lasting_push(float(age_s), correlation_s)[::-1] for age_s in ages_s])
+    added = 2 / correlation_s * (pushes.T * weights) @ pushes
+    variances = np.repeat(np.square((acceleration, angular_acceleration)), 3)
     Q = np.zeros((STATES, STATES))
     for i, rows in enumerate(ORDERS):
         for j, columns in enumerate(ORDERS):
             Q[rows, columns] = added[i, j] * variances
+    Q.setflags(write=False)
     return Q
 
 
