@@ -74,16 +74,20 @@ def seen_from(
     """
     found: dict[int, list[LayerDetection]] = {}
     T_chaser_target = mission.camera.T_chaser_cam.matrix() @ T_cam_target
-    for expected in visible_layers(T_chaser_target, mission, CAMERA):
-        if np.ptp(expected.corners_px, axis=0).min() < SMALLEST_SIDE_PX or (only and expected.marker_id not in only):
-            continue
+    visible = [
+        expected
+        for expected in visible_layers(T_chaser_target, mission, CAMERA)
+        if np.ptp(expected.corners_px, axis=0).min() >= SMALLEST_SIDE_PX and (not only or expected.marker_id in only)
+    ]
+    exact = [SeenLayer(one.marker_id, one.layer, one.corners_px, sigma_px, np.zeros((4, 3))) for one in visible]
+    root = np.linalg.cholesky(corner_noise(exact, mission.filter)) if exact else np.zeros((0, 0))
+    noise_px = (root @ rng.standard_normal(len(root))).reshape(-1, 4, 2)
+    for expected, new_px in zip(visible, noise_px, strict=True):
         bias = (bias_px or {}).get(expected.marker_id, np.zeros(BIAS_DOF))
         outward_px = bias[0] * outward_shift(expected.corners_px[None])[0]
         biased_px = expected.corners_px + outward_px + bias[1:3] + bias[3:].reshape(4, 2)
-        exact = SeenLayer(expected.marker_id, expected.layer, expected.corners_px, sigma_px, np.zeros((4, 3)))
-        root = np.linalg.cholesky(corner_noise([exact], mission.filter))
-        corners_px = biased_px + (root @ rng.standard_normal(8)).reshape(4, 2)
-        found.setdefault(expected.marker_id, []).append(LayerDetection(expected.layer, corners_px, sigma_px))
+        layer = LayerDetection(expected.layer, biased_px + new_px, sigma_px)
+        found.setdefault(expected.marker_id, []).append(layer)
     return Detections(
         t_capture_ns=T0_NS + round(t_s * 1e9),
         camera=mission.camera.name,
