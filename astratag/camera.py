@@ -143,7 +143,7 @@ class Camera:
         """Return where pixels (N, 2) would be without distortion, in normalised coordinates x/z, y/z (N, 2)."""
         points = np.ascontiguousarray(points_px, dtype=float).reshape(-1, 1, 2)
         if not (self.distortion.any() and len(points)):
-            return (points.reshape(-1, 2) - self.K[:2, 2]) @ np.linalg.inv(self.K[:2, :2]).T
+            return (points.reshape(-1, 2) - self.K[:2, 2]) / self.K.diagonal()[:2]
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-12)
         return cv2.undistortPoints(points, self.K, self.distortion, criteria=criteria).reshape(-1, 2)
 
@@ -196,8 +196,8 @@ def _projection_jacobian(points_cam: Array, lens: Array) -> Array:
     J = np.empty((len(points_cam), 2, 3))
     for i in range(len(points_cam)):
         x, y, z = points_cam[i]
-        J[i, 0] = pixel_slope(x, y, z, lens, 1.0, 0.0)
-        J[i, 1] = pixel_slope(x, y, z, lens, 0.0, 1.0)
+        J[i, 0, 0], J[i, 0, 1], J[i, 0, 2] = pixel_slope(x, y, z, lens, 1.0, 0.0)
+        J[i, 1, 0], J[i, 1, 1], J[i, 1, 2] = pixel_slope(x, y, z, lens, 0.0, 1.0)
     return J
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from astratag.align import COARSE_BLUR, COARSE_STEPS, FINE_STEPS, align
-from astratag.compiled import CUBE, MATRIX, compiled
+from astratag.compiled import CUBE, GRAY, INT, MATRIX, compiled
 from astratag.geometry import LAYERS, TEMPLATE_UNITS, square
 from astratag.relight import RELIT_SAMPLES, relit_cells
+from astratag.sampling import bilinear
 from astratag.search import BentQuads
 from astratag.signature import (
     LEAST_SEEN,
@@ -20,7 +22,6 @@ from astratag.signature import (
     Reading,
     blur_level,
     cell_values,
-    sample,
 )
 from astratag.tps import KNOTS, ThinPlate
 from astratag.warp import LEAST_DEPTH, BentWarp, FittedWarp, HomographyWarp, plane_of
@@ -71,10 +72,14 @@ class Candidate:
         return float(looks_large(self.corners_px[None])[0])
 
 
+@compiled(CUBE)
 def looks_large(quads: Array) -> Array:
     """Return the roots of the areas (Q,) of quads (Q, 4, 2)."""
-    diagonals = quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1]
-    return np.sqrt(np.abs(diagonals[0][:, 0] * diagonals[1][:, 1] - diagonals[0][:, 1] * diagonals[1][:, 0]) / 2)
+    sizes = np.empty(len(quads))
+    for q in range(len(quads)):
+        (ax, ay), (bx, by), (cx, cy), (dx, dy) = quads[q]
+        sizes[q] = math.sqrt(abs((cx - ax) * (dy - by) - (cy - ay) * (dx - bx)) / 2)
+    return sizes
 
 
 def flat_candidates(gray: Image, quads: Array, codebook: Codebook) -> list[Candidate]:
@@ -109,13 +114,24 @@ def relit_candidates(gray: Image, light: NDArray[np.float32], quads: Array, code
 
 def framed(gray: Image, quads: Array, least: int = LEAST_FRAMED) -> Array:
     """Return those of quads (Q, 4, 2) that are darker inside their edges than outside, on at least so many sides."""
-    return quads[darker_inside(sample(gray, points_in(quads, FRAME)), least)] if len(quads) else quads
+    return quads[darker_inside(gray, points_in(quads, FRAME), least)] if len(quads) else quads
 
 
-def darker_inside(values: Array, least: int = LEAST_FRAMED) -> NDArray[np.bool_]:
-    """Return which squares are darker inside than outside on so many sides, from gray values (Q, F) at ``FRAME``."""
-    outside, inside = values.reshape(len(values), 2, 4, -1).mean(axis=3).swapaxes(0, 1)
-    return (outside - inside >= LEAST_STEP_GREY).sum(axis=1) >= least
+@compiled(GRAY, CUBE, INT)
+def darker_inside(gray: Image, at_px: Array, least: int) -> NDArray[np.bool_]:
+    """Return which squares are darker inside than outside on so many sides, where ``FRAME`` lies (Q, F, 2) in them."""
+    count, along = len(at_px), at_px.shape[1] // 8
+    darker = np.empty(count, dtype=np.bool_)
+    for q in range(count):
+        sides = 0
+        for side in range(4):
+            step = 0.0
+            for i in range(side * along, (side + 1) * along):
+                inside = at_px[q, 4 * along + i]
+                step += bilinear(gray, at_px[q, i, 0], at_px[q, i, 1]) - bilinear(gray, inside[0], inside[1])
+            sides += step >= LEAST_STEP_GREY * along
+        darker[q] = sides >= least
+    return darker
 
 
 def _frame_points() -> Array:
@@ -187,7 +203,7 @@ def _framed_bent(gray: Image, shapes: BentQuads) -> NDArray[np.bool_]:
     """Return which shapes are darker inside their bulging edges than outside, on at least three sides."""
     shares = np.maximum(_profiles(FRAME)[0], 0.0)
     at = points_in(shapes.corners_px, FRAME) + shares @ shapes.bulges_px
-    return darker_inside(sample(gray, at))
+    return darker_inside(gray, at, LEAST_FRAMED)
 
 
 def _bent(gray: Image, corners_px: Array, bulges_px: Array, codebook: Codebook) -> Candidate | None:

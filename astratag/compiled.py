@@ -48,7 +48,10 @@ VECTOR, MATRIX, CUBE = array(REAL, 1), array(REAL, 2), array(REAL, 3)
 FLAGS, FLAG_MATRIX = array(BOOL, 1), array(BOOL, 2)
 INDICES = array(INT, 1)
 BITS = array(types.uint8, 2)
+TABLE = array(types.int32, 2)
 """All in C order, and only read."""
+INTO_SHAPES, INTO_POINTS = types.Array(types.uint8, 2, "C"), types.Array(REAL, 2, "C")
+"""Shapes (H, W) and points (N, 2) that are written to as well."""
 PLACES = (MATRIX, array(SINGLE, 2))
 """Points (N, 2), exact or to what a pixel needs."""
 PLACES_OF_MANY = (CUBE, array(SINGLE, 3))

@@ -124,7 +124,7 @@ class Confirmer(Describer):
             detection = self.describe(view, marker_id, fit, "cylinder", MANY_WARPS)
             if detection is not None and self._layers_agree(view, detection, fit.warp, looks):
                 return detection
-        by_pixels = self._synthesis.align(view.light, warp, marker_id, PIXEL_BLUR)
+        by_pixels = self._synthesis.align(view.lit, warp, marker_id, PIXEL_BLUR)
         if by_pixels is not None and by_pixels.correlation > LEAST_POLISHED:
             return self._described_by_pixels(
                 view, marker_id, by_pixels, seen.layer, seen.reading.correlation, "cylinder"
@@ -302,7 +302,7 @@ class Confirmer(Describer):
 
     def _confirm_pixels(self, view: View, rough: Rough) -> Detection | None:
         """Return the marker that a rough square is a layer of."""
-        seen = match(self._synthesis, view.light, rough, PIXEL_BLUR, self._accept_of_pixels)
+        seen = match(self._synthesis, view.lit, rough, PIXEL_BLUR, self._accept_of_pixels)
         if seen is None:
             return None
         return self._described_by_pixels(view, seen.marker_id, seen.alignment, seen.layer, seen.correlation, "planar")

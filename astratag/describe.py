@@ -34,7 +34,7 @@ from astratag.surface import Cylinder, Flat, Surface
 from astratag.synthesis import Alignment, Synthesis
 from astratag.transforms import difference
 from astratag.view import View
-from astratag.warp import OUTSIDE_PX, FittedWarp, HomographyWarp, PoseWarp, sides_of
+from astratag.warp import OUTSIDE_PX, FittedWarp, HomographyWarp, PoseWarp, quads_inside, sides_of
 
 Array = NDArray[np.float64]
 
@@ -128,8 +128,9 @@ class Describer:
         layers: tuple[LayerDetection, ...],
         method: str,
         covariance: Array | None = None,
+        planar: tuple[PlanarPose, ...] = (),
     ) -> Detection:
-        """Return a detection; ``covariance`` is of a warp that is a pose."""
+        """Return a detection; ``covariance`` is of a warp that is a pose, ``planar`` both poses if known."""
         spec = self.spec(reading.marker_id)
         seen_from = warp.pose if isinstance(warp, CylinderWarp) else warp
         surface = seen_from.surface if isinstance(seen_from, PoseWarp) else spec.surface or Flat()
@@ -139,10 +140,11 @@ class Describer:
         poses: tuple[PlanarPose, ...] = ()
         if view.camera is not None:
             fitted = seen_from.T_cam_marker if isinstance(seen_from, PoseWarp) else None
-            poses = planar_poses(view.camera, layers, spec.side_m, surface, fitted)
+            poses = planar or planar_poses(view.camera, layers, spec.side_m, surface, fitted)
             if isinstance(seen_from, PoseWarp):
                 T_cam_marker = seen_from.T_cam_marker
-                rms_px = next((pose.reprojection_rms_px for pose in poses if pose.T_cam_marker is fitted), None)
+                exact = 0.0 if planar else None  # by pixels, corners are where the pose has them
+                rms_px = next((pose.reprojection_rms_px for pose in poses if pose.T_cam_marker is fitted), exact)
             elif poses:
                 start = PoseWarp(view.camera, spec.side_m, surface, poses[0].T_cam_marker)
                 T_cam_marker, covariance, rms_px = refine_on_corners(start, layers)
@@ -165,30 +167,43 @@ class Describer:
 
     def match_near(self, view: View, marker_id: int, warp: FittedWarp, method: str) -> Detection | None:
         """Return a marker whose print lies where ``warp`` has it to a fraction of a cell, by all its pixels."""
-        aligned = self._synthesis.align(view.light, warp, marker_id, PIXEL_BLUR)
+        aligned = self._synthesis.align(view.lit, warp, marker_id, PIXEL_BLUR)
         if aligned is None or aligned.correlation < LEAST_POLISHED:
             return None
-        scores = self._synthesis.read(view.light, aligned.warp, aligned.blur_px)
+        scores = self._synthesis.read(view.lit, aligned.warp, aligned.blur_px)
         row = self.dictionary.row(marker_id)
         if scores[row, 0] < self._accept_of_pixels or scores.argmax() != 4 * row:
             return None
         return self._described_by_pixels(view, marker_id, aligned, 0, float(scores[row, 0]), method)
 
     def _described_by_pixels(
-        self, view: View, marker_id: int, aligned: Alignment, layer: int, correlation: float, method: str
+        self,
+        view: View,
+        marker_id: int,
+        aligned: Alignment,
+        layer: int,
+        correlation: float,
+        method: str,
+        before: Detection | None = None,
     ) -> Detection | None:
-        """Return the detection an alignment amounts to: one layer, whose corners stand for all pixels of the print."""
+        """Return the detection an alignment amounts to: one layer, whose corners stand for all pixels of the print.
+
+        What was read, and both planar poses, are those of the detection ``before`` it where there is one.
+        """
         square_px = aligned.warp(SQUARES[layer])
         if not inside(square_px, view.gray.shape):
             return None
-        wrong = self._codebook.read_as(layer_cells(view.light, aligned.warp, layer), marker_id).hamming
-        if self._codebook.tau_hamming is not None and wrong > self._codebook.tau_hamming:
-            return None
+        if before is None or self._codebook.tau_hamming is not None:
+            wrong = self._codebook.read_as(layer_cells(view.light, aligned.warp, layer), marker_id).hamming
+            if self._codebook.tau_hamming is not None and wrong > self._codebook.tau_hamming:
+                return None
+        wrong, cells = (wrong, INDEPENDENT_CELLS) if before is None else (before.hamming, before.cells)
         layers = (LayerDetection(layer, square_px, aligned.sigma_px(SQUARES[layer])),)
         is_pose = isinstance(aligned.warp, PoseWarp | CylinderWarp)
         covariance = aligned.cautious_covariance[:6, :6] if is_pose else None
-        reading = Reading(marker_id, 0, correlation, wrong, cells=INDEPENDENT_CELLS)
-        return self._described(view, reading, aligned.warp, layers, method, covariance)
+        reading = Reading(marker_id, 0, correlation, wrong, cells=cells)
+        planar = before.planar_poses if before is not None and is_pose else ()
+        return self._described(view, reading, aligned.warp, layers, method, covariance, planar)
 
     def polished(self, view: View, detection: Detection, below_px: float = POLISHED_PX) -> Detection:
         """Return a detection measured again by all its pixels when it looks small: from each pose its corners allow."""
@@ -207,15 +222,15 @@ class Describer:
             poses = [detection.T_cam_marker, *mirrored]
             starts = [PoseWarp(view.camera, spec.side_m, spec.surface, T_cam_marker) for T_cam_marker in poses]
         align = partial(self._synthesis.align, settled_px=POLISHED_TO_PX)
-        aligned = [align(view.light, start, detection.marker_id, PIXEL_BLUR) for start in starts]
+        aligned = [align(view.lit, start, detection.marker_id, PIXEL_BLUR) for start in starts]
         best = max((one for one in aligned if one is not None), key=lambda one: one.correlation, default=None)
         if best is None or best.correlation < LEAST_POLISHED:
             return detection
-        again = self._described_by_pixels(view, detection.marker_id, best, 0, detection.correlation, detection.method)
+        marker_id, read, method = detection.marker_id, detection.correlation, detection.method
+        again = self._described_by_pixels(view, marker_id, best, 0, read, method, detection)
         if again is None:
             return detection
-        both = detection.planar_poses or again.planar_poses
-        return replace(again, planar_poses=both, hamming=detection.hamming, cells=detection.cells)
+        return replace(again, planar_poses=detection.planar_poses or again.planar_poses)
 
     def with_other_pose(self, view: View, detection: Detection, fit: Fit) -> Detection:
         """Return the detection fitted from the other planar pose when corners allow both and the edges prefer it."""
@@ -237,7 +252,7 @@ class Describer:
         of which enough cells are in it.
         """
         best: Reading | None = None
-        whole = [inside(corners, view.gray.shape) for corners in warp(CELLS_WITHIN)]
+        whole = quads_inside(warp(CELLS_WITHIN), *view.gray.shape).tolist()
         for layer in LAYERS:
             seen = None
             if not any(whole):
@@ -263,7 +278,7 @@ class Describer:
         Only ``among`` (48,) of its cells when these are given.
         """
         if relit:
-            cells, seen = relit_layer(view.light, warp, layer_points(RELIT_SAMPLES, LAYERS[layer]))
+            cells, seen = relit_layer(view.lit, warp, layer_points(RELIT_SAMPLES, LAYERS[layer]))
             return self._codebook.read_seen_as(cells, seen if among is None else seen & among, marker_id)
         cells = layer_cells(view.light, warp, layer)
         if among is None:
@@ -284,7 +299,7 @@ def _listed(markers: Mapping[int, MarkerSpec] | None, dictionary: Dictionary) ->
 
 def inside(corners_px: Array, shape: tuple[int, ...]) -> bool:
     """Return whether all corners (4, 2) are inside an image of a shape."""
-    return all(0 <= x <= shape[1] - 1 and 0 <= y <= shape[0] - 1 for x, y in corners_px.tolist())
+    return bool(quads_inside(np.ascontiguousarray(corners_px[None], dtype=float), *shape)[0])
 
 
 def lead(scores: Array, layer: int) -> float:
@@ -300,7 +315,7 @@ def _apart(T_cam_marker: Array, other: Array) -> bool:
 def outer_corners(warp: FittedWarp) -> Array:
     """Return the print's outer corners (4, 2) in the image; one behind the camera is where its sides' lines meet."""
     corners_px = warp(OUTER)
-    if (corners_px > OUTSIDE_PX).all():
+    if corners_px.min() > OUTSIDE_PX:
         return corners_px
     inside_px = warp(SQUARES[-1])
     H = cv2.getPerspectiveTransform(SQUARES[-1].astype(np.float32), inside_px.astype(np.float32))

@@ -38,6 +38,7 @@ from astratag.dictionary import Dictionary
 from astratag.edges import Transfer, inverse_transfer
 from astratag.effort import COST, Effort, first_distinct
 from astratag.matching import rough_matches
+from astratag.sampling import Light
 from astratag.search import (
     BROAD,
     COARSE,
@@ -73,9 +74,12 @@ EVERY_WAY = (PLAIN, NARROW, FAINT)
 """Ways of telling ink from paper in which listed markers are looked for that were not found at once."""
 COVER_REACH_PX = 30_000
 """OpenCV draws no further."""
-MAX_READ_BY_PIXELS, MAX_MATCHED = 12, 5
-"""Squares in one image that are read by all their pixels; and that are aligned with a print."""
-LEAST_CLOSE_PX = 16.0
+MAX_READ_BY_PIXELS, MAX_MATCHED = 12, 2
+"""Squares in one image that are read by all their pixels; and that are aligned with a print.
+
+Of 58 markers found so each was the first to be aligned.
+"""
+LEAST_CLOSE_PX = 18.0
 """Flat squares smaller than this are left to their pixels.
 
 Of 300 markers found by their edges or an alignment the smallest square was 19 pixels wide; what chance makes read like
@@ -112,8 +116,8 @@ class Detector(Confirmer):
         super().__init__(
             dictionary, side_m, surface, markers, false_accept_rate=false_accept_rate, tau_hamming=tau_hamming
         )
-        self._light_of = inverse_transfer(transfer)
-        self._light = np.zeros((0, 0), dtype=np.float32)
+        self._of_gray = inverse_transfer(transfer).astype(float)
+        self._lit = np.zeros((0, 0), dtype=np.float32)
 
     def detect(self, image: NDArray[np.uint8], camera: Camera | None = None) -> list[Detection]:
         """Return the markers in a gray (H, W) or BGR (H, W, 3) uint8 image, the surest first; poses need ``camera``.
@@ -173,20 +177,16 @@ class Detector(Confirmer):
     ) -> View:
         """Return an image made ready: all of it, or only ``boxes`` ((2, 2) pixels: low and high x, y) of its light.
 
-        The light is kept in one buffer, which the next call overwrites: fresh memory costs more than the table.
+        The light is kept in one buffer, which the next image's overwrites: fresh memory costs more than the table.
         Raises ValueError as ``detect`` does.
         """
         gray = as_gray(image)
         if camera is not None:
             instance(camera, Camera, "camera", "Camera.load(path) reads one")
             camera.require_size(gray.shape[1], gray.shape[0])
-        if self._light.shape != gray.shape:
-            self._light = np.zeros(gray.shape, dtype=np.float32)
-        whole = np.array([(0, 0), gray.shape[::-1]])
-        for (left, top), (right, bottom) in [whole] if boxes is None else boxes:
-            part = slice(int(top), int(bottom)), slice(int(left), int(right))
-            cv2.LUT(gray[part], self._light_of, dst=self._light[part])
-        return View(gray, self._light, camera, Effort(gray.size))
+        if self._lit.shape != gray.shape:
+            self._lit = np.zeros(gray.shape, dtype=np.float32)
+        return View(gray, Light(gray, self._of_gray), camera, Effort(gray.size), self._lit, boxes)
 
     def search(self, view: View, outlines: Outlines, *, whole: bool = False) -> list[Detection]:
         """Return the markers among outlines read as if flat, each once, the surest first; see ``quads_of``."""
@@ -199,7 +199,7 @@ class Detector(Confirmer):
             COST.relit * min(len(quads), MAX_RELIT_READ)
         ):
             return []
-        return surest(self._confirm_all(view, relit_candidates(view.gray, view.light, quads, self._codebook)))
+        return surest(self._confirm_all(view, relit_candidates(view.gray, view.lit, quads, self._codebook)))
 
     def _search_bent(self, view: View, outlines: Outlines) -> list[Detection]:
         """Return the markers among outlines bent about cylinders, none when every marker is on a plane."""
@@ -218,8 +218,10 @@ class Detector(Confirmer):
         """Return the markers bent about cylinders so much, or so far turned, that none was found otherwise."""
         if not self._bends:
             return []
-        beside = bent_beside(view.some_camera, near_sides(_outlines(view, NARROW)))
-        return self._search_bent(view, _outlines(view, THIN)) or self._search_curved(view, beside)
+        found, outlines = self._search_bent(view, _outlines(view, THIN)), _outlines(view, NARROW)
+        if found or not view.effort.spend(COST.border_pixel * outlines.followed):
+            return found
+        return self._search_curved(view, bent_beside(view.some_camera, near_sides(outlines)))
 
     def _search_by_spline(self, view: View) -> list[Detection]:
         """Return the markers on surfaces that no cylinder explains."""
@@ -242,7 +244,7 @@ class Detector(Confirmer):
         Those in uneven light are read cell by cell; and bent squares that none was found through by then.
         """
         tried, left = np.zeros((0, 4, 2)), MAX_MATCHED
-        for how in (TINY, BROAD, SLANTED, THIN, STEEP):
+        for how in (TINY, SLANTED, BROAD, STEEP):
             quads = quads_of(_outlines(view, how))
             found = self._search_relit(view, quads)
             if found:
@@ -250,7 +252,7 @@ class Detector(Confirmer):
             fresh = first_distinct(framed(view.gray, quads), tried, MAX_READ_BY_PIXELS - len(tried))
             fresh = fresh[: view.effort.afford(COST.by_pixels, len(fresh))]
             tried = np.concatenate([tried, fresh])
-            rough = rough_matches(self._synthesis, view.light, fresh, PIXEL_BLUR)[:left]
+            rough = rough_matches(self._synthesis, view.lit, fresh, PIXEL_BLUR)[:left]
             rough = rough[: view.effort.afford(COST.matched, len(rough))]
             left -= len(rough)
             found = [seen for seen in (self._confirm_pixels(view, one) for one in rough) if seen is not None]
@@ -307,8 +309,8 @@ def _outlines(view: View, how: Binarisation) -> Outlines:
     if how.scale not in view.scaled:
         view.scaled[how.scale] = scaled(view.gray, how.scale)
     found = find_outlines(view.gray, how, view.scaled[how.scale])
-    points = COST.contour_point * sum(map(len, found.others))
-    view.outlines[how] = found if view.effort.spend(points + COST.outline * len(found.contours)) else NONE
+    borders = COST.border_pixel * found.followed
+    view.outlines[how] = found if view.effort.spend(borders + COST.outline * found.contours.count) else NONE
     return view.outlines[how]
 
 

@@ -15,9 +15,12 @@ SAME_SQUARE = 0.04
 """Squares whose centres and sides differ by less than this fraction are one square found twice."""
 
 
-LEAST_UNITS, UNITS_A_PIXEL = 72_000, 0.012
-"""What one image is worth whatever its size, and more for each pixel: what the hardest markers of 12 pixels and at 83
-degrees of tilt take to be found among clutter.
+BETTER = 0.03
+"""A square that was looked at is looked at again where it reads so much better."""
+LEAST_UNITS, UNITS_A_PIXEL, MOST_UNITS = 12_000, 0.048, 34_000
+"""What one image is worth whatever its size, and more for each pixel, up to a limit: ten times what a plain one with a
+marker takes, which is found in a large one at half its resolution.  The hardest markers of the benchmark, at 640x480,
+take 26 000.
 
 A unit is what takes about a microsecond, counted and never measured, so that the same image always gets the same.
 """
@@ -27,7 +30,7 @@ class Effort:
     """How many units of effort an image is worth, and how many were spent on it."""
 
     def __init__(self, pixels: int) -> None:
-        self.most = LEAST_UNITS + UNITS_A_PIXEL * pixels
+        self.most = min(LEAST_UNITS + UNITS_A_PIXEL * pixels, MOST_UNITS)
         self.spent = 0.0
 
     def spend(self, units: float) -> bool:
@@ -48,25 +51,26 @@ class Effort:
 class Costs:
     """What is done in an image, in units."""
 
-    pixel: float = 0.007
+    pixel: float = 0.0025
     """Of a picture in which outlines are looked for."""
-    resized_pixel: float = 0.001
+    resized_pixel: float = 0.0005
     """More of the whole picture, at the resolution worked at."""
-    contour_point: float = 0.1
-    outline: float = 8.0
+    border_pixel: float = 0.03
+    """Of the borders of all shapes: followed, or looked through for near sides."""
+    outline: float = 10.0
     """Simplified, and read as if flat."""
-    edges: float = 400.0
-    aligned: float = 2500.0
-    bent: float = 2.0
+    edges: float = 700.0
+    aligned: float = 1400.0
+    bent: float = 1.0
     """A bent square whose frame is looked at."""
-    bent_read: float = 2000.0
+    bent_read: float = 600.0
     """Those that have one, and how the best look."""
-    curved: float = 4000.0
+    curved: float = 1500.0
     relit: float = 15.0
     """An outline read cell by cell."""
-    by_pixels: float = 500.0
-    matched: float = 5000.0
-    spline: float = 600.0
+    by_pixels: float = 150.0
+    matched: float = 3500.0
+    spline: float = 350.0
 
 
 COST = Costs()
@@ -88,11 +92,11 @@ class Tries:
 
 
 def _no_better(candidate: Candidate, before: Candidate) -> bool:
-    """Return whether a candidate is the same square as one before, and reads the same no better."""
+    """Return whether a candidate is the same square as one before, and reads the same not much better."""
     if candidate.reading.marker_id != before.reading.marker_id or candidate.bent != before.bent:
         return False
     same = same_square(candidate.corners_px[None], before.corners_px)[0]
-    return bool(same) and candidate.reading.correlation <= before.reading.correlation
+    return bool(same) and candidate.reading.correlation < before.reading.correlation + BETTER
 
 
 def same_square(quads: Array, quad: Array) -> NDArray[np.bool_]:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from astratag.edges import EDGE_LAYER, EDGES
 from astratag.fit import EdgeFit, fit_edges
 from astratag.geometry import SQUARES
 from astratag.neighbours import Crossings
+from astratag.sampling import Light
 from astratag.warp import BentWarp, FittedWarp, HomographyWarp, sides_of
 
-Light = NDArray[np.float32]
 Fit = EdgeFit[FittedWarp]
 
 ALL_EDGES = np.arange(len(EDGES))
@@ -49,7 +48,7 @@ def grow(light: Light, warp: FittedWarp, layer: int, near: Crossings) -> Fit | N
     bent = _grow_through(light, BentWarp(warp, np.zeros((2, 3))), layer, search_px, near)
     if flat is None or bent is None:
         return flat or bent
-    several = len(set(EDGE_LAYER[bent.points.edge[bent.weight.any(axis=1)]].tolist())) > 1
+    several = len(set(EDGE_LAYER[bent.edges[bent.weight.any(axis=1)]].tolist())) > 1
     return bent if several and bent.cost < CURVED_GAIN * flat.cost else flat
 
 

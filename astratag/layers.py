@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from astratag.compiled import INDICES, INT, MATRIX, REAL, VECTOR, array, compiled
 from astratag.detection import LayerDetection
 from astratag.edges import ALONG, EDGES, POINTS_PER_EDGE
-from astratag.fit import SHARP_REACH_PX, EdgeFit, followed
+from astratag.fit import EdgeFit, followed
 from astratag.geometry import LAYERS, square
-from astratag.warp import FittedWarp
+from astratag.pulls import SHARP_REACH_PX
+from astratag.warp import FittedWarp, quads_inside
 
 Array = NDArray[np.float64]
 
@@ -32,15 +35,15 @@ def measure_layers(fit: EdgeFit[FittedWarp], shape: tuple[int, int]) -> tuple[La
     """
     corners, sigma_px = _measured(
         fit.before(_CORNER_PROBES),
-        fit.points.edge,
+        fit.edges,
         fit.offset_px,
         fit.weight,
         fit.shared_px2,
-        fit.points.lie.reach_px,
+        fit.reach_px,
         *shape,
     )
-    seen = np.flatnonzero(sigma_px < np.inf).tolist()
-    return tuple(LayerDetection(layer, corners[layer], float(sigma_px[layer])) for layer in seen)
+    found = enumerate(zip(corners, sigma_px.tolist(), strict=True))
+    return tuple(LayerDetection(layer, at_px, sigma) for layer, (at_px, sigma) in found if sigma < math.inf)
 
 
 def _corner_probes() -> Array:
@@ -125,10 +128,7 @@ def _measured(
     for layer in range(layers):
         if nearest_px[layer] > 0 and nearest_px[layer] >= least_px:
             square_px, variance = _corners(around_px, layer, rows[layer], offset, weight)
-            inside = True
-            for x, y in square_px:
-                inside &= 0 <= x <= width - 1 and 0 <= y <= height - 1
-            if inside:
+            if quads_inside(square_px.reshape(1, 4, 2), height, width)[0]:
                 points, common = 0, 0.0
                 for row in rows[layer]:
                     points += int(np.count_nonzero(weight[row]))

@@ -6,18 +6,15 @@ ink to paper is found between samples.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.compiled import CUBE, FLAG_MATRIX, FLAGS, INT, LIGHT, MATRIX, REAL, VECTOR, compiled
-from astratag.edges import ALONG_SHARE, FEW_INTERVALS, POINTS_PER_EDGE, template_of
+from astratag.compiled import CUBE, FLAG_MATRIX, FLAGS, GRAY, INT, MATRIX, REAL, VECTOR, compiled
+from astratag.edges import ALONG_SHARE, FEW_INTERVALS, POINTS_PER_EDGE
 from astratag.normal import ranked
-from astratag.sampling import between
-from astratag.warp import FittedWarp
+from astratag.sampling import light_between
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -39,7 +36,11 @@ LEAST_RISE, LEAST_RISE_GREY = 0.35, 0.05
 SATURATED, WHOLE_RISE, CLIPPED_PX = 250.0, 0.75, 1.7
 """Where paper is as bright as this, an edge that rises by less than this share of it is cut off at the top by glare,
 and looks so many pixels nearer to the ink for each share that is missing (at a blur of 0.8 pixels)."""
-
+SMOOTHING_OF_LENS, REACH_OF_SMOOTHING, WORTHWHILE = 0.8, 5.0, 1.4
+"""Width of the filter for blurred edges: over the blur's, at most a part of their reach, and from which gain on."""
+SMOOTHING_STEP_PX = 0.25
+FILTER_REACH, BESIDE_PX = 3.5, 0.3
+"""Where the filter ends, in its standard deviations; and how near its middle may come to where profiles end."""
 APART_PX = 3.0
 """Edges at least this far from their neighbours have whole ink and whole paper beside them."""
 MOST_OF_COVER, DARKEST = 0.5, 0.5
@@ -47,13 +48,18 @@ MOST_OF_COVER, DARKEST = 0.5, 0.5
 of all points show; ink darker than this, of 255, is noise."""
 
 
-class Lie(NamedTuple):
-    """How E edges of M points each lie in the image where they are predicted, x and y first.
+class Edges(NamedTuple):
+    """How E edges of M points each lie in the image where they are predicted, x and y first, and where they were found.
 
-    ``normal`` (2, E, M) is the image unit vector from ink to paper at the points ``predicted_px`` (2, E, M);
+    ``predicted_px`` (2, E, M) are points on them and ``normal`` (2, E, M) the image unit vectors from ink to paper;
     ``length_px`` (E,) is how long an edge looks, ``unit_px`` (E, M) how large a template unit looks across it and
     ``reach_px`` (E,) how far it is from its neighbours.  For the outermost edges ``margin_px`` (E, M) is how wide
     the quiet margin looks.
+
+    ``offset_px`` (E, M) is the distance from there along the normals; only where ``found``, which is only where
+    ``in_view``.  The points ``alone`` (E, M) are those furthest from their neighbours; ``blur_px`` is the standard
+    deviation of all that blurs these: lens, pixel, interpolation, derivative filter, and neighbours a little.
+    ``clipped_px`` (E, M) is how far saturation may have moved the edge.
     """
 
     predicted_px: Array
@@ -62,80 +68,17 @@ class Lie(NamedTuple):
     unit_px: Array
     reach_px: Array
     margin_px: Array
-
-
-@dataclass(frozen=True, eq=False)
-class EdgePoints:
-    """Where the edges were found: E edges of M points each.
-
-    ``edge`` (E,) indexes ``EDGES``; how they ``lie`` is of what was predicted.  ``offset_px`` (E, M) is the distance
-    from there along the normals; only where ``found``, which is only where ``in_view``.  The points ``alone`` (E, M)
-    are those furthest from their neighbours; ``blur_px`` is the standard deviation of all that blurs these: lens,
-    pixel, interpolation, derivative filter, and neighbours a little.  ``clipped_px`` (E, M) is how far saturation may
-    have moved the edge.
-    """
-
-    edge: NDArray[np.int64]
-    lie: Lie
     offset_px: Array
     found: Mask
     in_view: Mask
     alone: Mask
     blur_px: float
-    smoothing_px: float
     clipped_px: Array
-
-    @property
-    def lens_px(self) -> float:
-        """Return the standard deviation of what blurs the image, the derivative filter left out."""
-        return float(np.sqrt(self.blur_px**2 - self.smoothing_px**2))
-
-
-def locate(
-    light: NDArray[np.float32],
-    warp: FittedWarp,
-    edges: NDArray[np.int64],
-    search_px: float,
-    smoothing_px: float = SMOOTHING_PX,
-) -> EdgePoints:
-    """Look for ``edges`` (indices of ``EDGES``) up to ``search_px`` from where ``warp`` predicts them.
-
-    ``light`` is the image in linear light.  An edge is never looked for beyond its own reach, so that
-    neighbours are not taken for it.  ``smoothing_px`` is the standard deviation of the derivative filter.
-    """
-    template = template_of(edges)
-    half = int(np.ceil((search_px + 3 * smoothing_px) / STEP_PX))
-    lie = Lie(*_lie(warp(template.probes), template.to_paper, template.reach))
-    in_view = _in_view(lie.predicted_px, warp.visible(template.few), half * STEP_PX, *light.shape)
-    profiles, ink, paper = _profiles(light, lie.predicted_px, lie.normal, half)
-    limit_px = np.fmin(min(search_px, half * STEP_PX - 3 * smoothing_px + 0.3), WITHIN_REACH * lie.reach_px)
-    slopes = profiles @ _derivative(2 * half + 1, smoothing_px, int(limit_px.max() / STEP_PX) + 2)
-    offset_px, rise, beside = _steepest_rise(slopes, limit_px)
-    found, alone, blur_px, clipped_px = _judged(ink, paper, offset_px, rise, beside, in_view, lie.reach_px)
-    offset_px = np.where(found, offset_px, 0.0)
-    return EdgePoints(edges, lie, offset_px, found, in_view, alone, blur_px, smoothing_px, clipped_px)
-
-
-@cache
-def _derivative(samples: int, smoothing_px: float, kept: int) -> Array:
-    """Return the matrix (S, T) that takes profiles (..., S), continued at their ends, to smoothed slopes a pixel.
-
-    Of the slopes those in the middle are kept, ``kept`` to either side.
-    """
-    reach = int(np.ceil(3.5 * smoothing_px / STEP_PX))
-    x = np.arange(-reach, reach + 1) * STEP_PX
-    kernel = x * np.exp(-0.5 * (x / smoothing_px) ** 2)
-    kernel /= kernel @ x
-    matrix = np.zeros((samples, samples))
-    for column in range(samples):
-        np.add.at(matrix[:, column], np.clip(np.arange(column - reach, column + reach + 1), 0, samples - 1), kernel)
-    middle = samples // 2
-    return np.ascontiguousarray(matrix[:, middle - kept : middle + kept + 1])
 
 
 @compiled(CUBE, VECTOR, VECTOR)
 def _lie(seen_px: Array, to_paper: Array, reach: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Return how E edges lie in the image, the fields of ``Lie``, from where their probes are seen (E, M + 10, 2)."""
+    """Return how E edges lie in the image, the first of ``Edges``, from where their probes are seen (E, M + 10, 2)."""
     edges, points = len(seen_px), POINTS_PER_EDGE
     few = (points - 1) // FEW_INTERVALS
     predicted, normal = np.empty((2, edges, points)), np.empty((2, edges, points))
@@ -182,50 +125,87 @@ def _in_view(predicted_px: Array, facing: Mask, profile_px: float, height: int, 
     return in_view
 
 
-@compiled(LIGHT, CUBE, CUBE, INT)
-def _profiles(light: NDArray[np.float32], predicted_px: Array, normal: Array, half: int) -> tuple[Array, Array, Array]:
-    """Return the light (E, M, 2 half + 1) every ``STEP_PX`` across edges, and the least and the most of each (E, M).
+@compiled(REAL)
+def _derivative(smoothing_px: float) -> Array:
+    """Return the weights, from one step on, of what comes so many steps later less what comes before: slopes a pixel.
+
+    Of profiles smoothed by a Gaussian of that standard deviation.
+    """
+    weights, moment = np.empty(int(np.ceil(FILTER_REACH * smoothing_px / STEP_PX))), 0.0
+    for k in range(len(weights)):
+        x_px = (k + 1) * STEP_PX
+        weights[k] = x_px * np.exp(-0.5 * (x_px / smoothing_px) ** 2)
+        moment += 2 * x_px * weights[k]
+    return weights / moment
+
+
+@compiled(GRAY, VECTOR, CUBE, CUBE, INT, INT)
+def _profiles(
+    gray: NDArray[np.uint8], of_gray: Array, predicted_px: Array, normal: Array, edge: int, half: int
+) -> Array:
+    """Return the light (2 half + 1, M) every ``STEP_PX`` across the points of an edge.
 
     Continued beyond the image as at its border; zeros where a warp gone astray predicts no place at all.
     """
-    _, edges, points = predicted_px.shape
-    profiles = np.zeros((edges, points, 2 * half + 1))
-    ink, paper = np.zeros((edges, points)), np.zeros((edges, points))
-    for e in range(edges):
+    points = predicted_px.shape[2]
+    profiles = np.empty((2 * half + 1, points))
+    for k in range(2 * half + 1):
+        away_px = (k - half) * STEP_PX
         for m in range(points):
-            x, y = predicted_px[0, e, m], predicted_px[1, e, m]
-            if abs(x) < FAR_PX and abs(y) < FAR_PX:
-                step_x, step_y = STEP_PX * normal[0, e, m], STEP_PX * normal[1, e, m]
-                least, most = np.inf, -np.inf
-                for k in range(2 * half + 1):
-                    value = between(light, x + (k - half) * step_x, y + (k - half) * step_y)
-                    profiles[e, m, k] = value
-                    least, most = min(least, value), max(most, value)
-                ink[e, m], paper[e, m] = least, most
-    return profiles, ink, paper
+            x = predicted_px[0, edge, m] + away_px * normal[0, edge, m]
+            y = predicted_px[1, edge, m] + away_px * normal[1, edge, m]
+            profiles[k, m] = light_between(gray, of_gray, x, y)
+    for m in range(points):
+        if not (abs(predicted_px[0, edge, m]) < FAR_PX and abs(predicted_px[1, edge, m]) < FAR_PX):
+            profiles[:, m] = 0.0
+    return profiles
 
 
-@compiled(CUBE, VECTOR)
-def _steepest_rise(slopes: Array, limit_px: Array) -> tuple[Array, Array, Array]:
-    """Return where (E, M) slopes (E, M, T) are steepest, in pixels from their middle, and how steep there.
+@compiled(MATRIX)
+def _extremes(profiles: Array) -> tuple[Array, Array]:
+    """Return the least and the most light (M,) on each of M profiles (S, M)."""
+    least, most = profiles[0].copy(), profiles[0].copy()
+    for k in range(1, len(profiles)):
+        for m in range(len(least)):
+            value = profiles[k, m]
+            least[m] = value if value < least[m] else least[m]
+            most[m] = value if value > most[m] else most[m]
+    return least, most
 
-    Also the product of the slopes a step before and after.
-    The place is NaN where it lies at the limit (E,) of the search: it is something else's.
+
+@compiled(MATRIX, VECTOR, INT)
+def _slopes(profiles: Array, weights: Array, kept: int) -> Array:
+    """Return how profiles (S, M), continued at their ends, rise (2 kept + 1, M) in their middle and about it."""
+    last, points = len(profiles) - 1, profiles.shape[1]
+    slopes = np.zeros((2 * kept + 1, points))
+    for k in range(2 * kept + 1):
+        at = last // 2 - kept + k
+        for step in range(len(weights)):
+            after, before = min(at + step + 1, last), max(at - step - 1, 0)
+            for m in range(points):
+                slopes[k, m] += weights[step] * (profiles[after, m] - profiles[before, m])
+    return slopes
+
+
+@compiled(MATRIX)
+def _steepest_rise(slopes: Array) -> tuple[Array, Array, Array]:
+    """Return where (M,) slopes (T, M) are steepest, in pixels from their middle, and how steep there.
+
+    Also the product of the slopes a step before and after.  The first and the last slope are not looked at but for
+    that.  The place is NaN where it lies at the limit of the search: it is something else's.
     """
-    edges, points, steps = slopes.shape
-    place, rise, beside = (np.full((edges, points), np.nan), np.empty((edges, points)), np.empty((edges, points)))
-    for e in range(edges):
-        kept = int((limit_px[e] + 1e-9) / STEP_PX)
-        for m in range(points):
-            best = steps // 2 - kept
-            for k in range(best + 1, steps // 2 + kept + 1):
-                if slopes[e, m, k] > slopes[e, m, best]:
-                    best = k
-            below, peak, above = slopes[e, m, best - 1], slopes[e, m, best], slopes[e, m, best + 1]
-            rise[e, m], beside[e, m] = peak, below * above
-            if below < peak and above <= peak:
-                at = best - steps // 2 + 0.5 * (above - below) / (2 * peak - below - above)
-                place[e, m] = at * STEP_PX
+    steps, points = slopes.shape
+    place, rise, beside = np.full(points, np.nan), np.empty(points), np.empty(points)
+    for m in range(points):
+        best = 1
+        for k in range(2, steps - 1):
+            if slopes[k, m] > slopes[best, m]:
+                best = k
+        below, peak, above = slopes[best - 1, m], slopes[best, m], slopes[best + 1, m]
+        rise[m], beside[m] = peak, below * above
+        if below < peak and above <= peak:
+            at = best - steps // 2 + 0.5 * (above - below) / (2 * peak - below - above)
+            place[m] = at * STEP_PX
     return place, rise, beside
 
 
@@ -286,3 +266,66 @@ def _judged(
     # slopes are bells; a Gaussian's logarithm is a parabola, whose width its values at the top and beside it tell
     ratio = min(max(slopes_beside / max(squared, 1e-9), LOW_RATIO), HIGH_RATIO)
     return found, alone, STEP_PX / np.sqrt(-np.log(ratio)), clipped_px
+
+
+@compiled(GRAY, VECTOR, CUBE, CUBE, VECTOR, FLAGS, REAL, REAL)
+def _seen(
+    gray: NDArray[np.uint8],
+    of_gray: Array,
+    predicted_px: Array,
+    normal: Array,
+    reach_px: Array,
+    facing: Mask,
+    search_px: float,
+    smoothing_px: float,
+) -> tuple[Array, Mask, Mask, Mask, float, Array]:
+    """Return where edges are found through a filter of standard deviation ``smoothing_px``: the rest of ``Edges``."""
+    half = int(np.ceil((search_px + 3 * smoothing_px) / STEP_PX))
+    within_px = min(search_px, half * STEP_PX - 3 * smoothing_px + BESIDE_PX)
+    _, edges, points = predicted_px.shape
+    in_view = _in_view(predicted_px, facing, half * STEP_PX, gray.shape[0], gray.shape[1])
+    weights = _derivative(smoothing_px)
+    ink, paper = np.empty((edges, points)), np.empty((edges, points))
+    offset_px, rise, beside = np.empty((edges, points)), np.empty((edges, points)), np.empty((edges, points))
+    for e in range(edges):
+        limit_px = WITHIN_REACH * reach_px[e]
+        kept = int(((limit_px if limit_px < within_px else within_px) + 1e-9) / STEP_PX)
+        profiles = _profiles(gray, of_gray, predicted_px, normal, e, half)
+        ink[e], paper[e] = _extremes(profiles)
+        offset_px[e], rise[e], beside[e] = _steepest_rise(_slopes(profiles, weights, kept + 1))
+    found, alone, blur_px, clipped_px = _judged(ink, paper, offset_px, rise, beside, in_view, reach_px)
+    for e in range(edges):
+        for m in range(points):
+            if not found[e, m]:
+                offset_px[e, m] = 0.0
+    return offset_px, found, in_view, alone, blur_px, clipped_px
+
+
+@compiled(GRAY, VECTOR, CUBE, FLAGS, VECTOR, VECTOR, REAL)
+def locate(
+    gray: NDArray[np.uint8],
+    of_gray: Array,
+    seen_px: Array,
+    facing: Mask,
+    to_paper: Array,
+    reach: Array,
+    search_px: float,
+) -> Edges:
+    """Look for E edges up to ``search_px`` from where their probes are predicted (E, M + 10, 2).
+
+    See ``sampling.Light`` for the image, and ``edges.Template`` for ``to_paper`` (E,) and ``reach`` (E,); ``facing``
+    (5 E,) is which of a few points of each face the viewer.  An edge is never looked for beyond its own reach, so that
+    neighbours are not taken for it.  Blurred ones are looked for once more through a wider filter, as far as neighbours
+    leave room for it.
+    """
+    predicted, normal, length, unit_px, reach_px, margin_px = _lie(seen_px, to_paper, reach)
+    seen = _seen(gray, of_gray, predicted, normal, reach_px, facing, search_px, SMOOTHING_PX)
+    lens_px = np.sqrt(seen[4] ** 2 - SMOOTHING_PX**2)
+    wider_px = min(SMOOTHING_OF_LENS * lens_px, reach_px.max() / REACH_OF_SMOOTHING)
+    if wider_px >= WORTHWHILE * SMOOTHING_PX:
+        wider_px = round(wider_px / SMOOTHING_STEP_PX) * SMOOTHING_STEP_PX
+        seen = _seen(gray, of_gray, predicted, normal, reach_px, facing, search_px, wider_px)
+    offset_px, found, in_view, alone, blur_px, clipped_px = seen
+    return Edges(
+        predicted, normal, length, unit_px, reach_px, margin_px, offset_px, found, in_view, alone, blur_px, clipped_px
+    )

@@ -10,8 +10,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.compiled import CHANNELS, CUBE, INDEX, INT, LIGHT, MATRIX, REAL, SINGLE, compiled
-from astratag.geometry import TEMPLATE_UNITS
+from astratag.compiled import CUBE, INDEX, INT, LIGHT, MATRIX, REAL, SINGLE, compiled
+from astratag.geometry import QUIET_MARGIN, TEMPLATE_UNITS
 
 Array = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -22,6 +22,10 @@ sees that is beyond the print."""
 LOOKS = AROUND + 1
 OUTSIDE = 0.3
 """How far beyond the black square pictures of a print reach, as a fraction of its side."""
+MARGIN = QUIET_MARGIN
+"""How far beyond it they are print."""
+SOFT_REACH = 4.0
+"""How many times its softness a blurred picture's edge is seen at most."""
 HAIR = 1e-3
 """What is beyond a picture lies so many texels before its last one, so that there is always a next."""
 LEAST_REST = 0.02
@@ -58,55 +62,74 @@ def _texel(x: np.float32, size: int) -> tuple[np.uint32, np.float32]:
     return np.uint32(before), x - np.float32(before)
 
 
-@compiled(CHANNELS, INDEX, INDEX, SINGLE, SINGLE, INT)
-def _mixed(
-    channels: Light, row: np.uint32, column: np.uint32, down: np.float32, right: np.float32, channel: int
-) -> np.float32:
-    """Return one channel between a texel and the next ones."""
+@compiled(LIGHT, INDEX, INDEX, SINGLE, SINGLE)
+def _mixed(picture: Light, row: np.uint32, column: np.uint32, down: np.float32, right: np.float32) -> np.float32:
+    """Return a picture between a texel and the next ones."""
     next_row, next_column = np.uint32(row + np.uint32(1)), np.uint32(column + np.uint32(1))
-    left, upper = channels[row, column, channel], channels[row, next_column, channel]
-    left += down * (channels[next_row, column, channel] - left)
-    upper += down * (channels[next_row, next_column, channel] - upper)
+    left, upper = picture[row, column], picture[row, next_column]
+    left += down * (picture[next_row, column] - left)
+    upper += down * (picture[next_row, next_column] - upper)
     return left + right * (upper - left)
 
 
-@compiled(CHANNELS, LIGHT, LIGHT, LIGHT)
-def _sums(channels: Light, spreads: Light, nodes: Light, moments: Light) -> Light:
-    """Return six moments of the brightness at nodes (K, 2) around each of N points, and the mean beyond (7, N).
+@compiled(LIGHT, LIGHT, LIGHT, LIGHT)
+def _sums(picture: Light, spreads: Light, nodes: Light, moments: Light) -> Light:
+    """Return moments (M, K) of a picture at nodes (K, 2) around each of N points: (M, N).
 
     ``spreads`` (5, N) are texels: x and y, and Cholesky factors xx, yx and yy that spread the nodes.  Points go in
     the inner loops, and in single precision, so that they become vector instructions.
     """
     count = spreads.shape[1]
-    sums, brightness = np.zeros((7, count), dtype=np.float32), np.empty(count, dtype=np.float32)
-    share = np.float32(1 / len(nodes))
+    sums, seen = np.zeros((len(moments), count), dtype=np.float32), np.empty(count, dtype=np.float32)
     for k in range(len(nodes)):
         u, v = nodes[k, 0], nodes[k, 1]
         for n in range(count):
             x, y = spreads[0, n] + spreads[2, n] * u, spreads[1, n] + spreads[3, n] * u + spreads[4, n] * v
-            column, right = _texel(x, channels.shape[1])
-            row, down = _texel(y, channels.shape[0])
-            brightness[n] = _mixed(channels, row, column, down, right, 0)
-            sums[6, n] += share * _mixed(channels, row, column, down, right, 1)
-        for m in range(6):
+            column, right = _texel(x, picture.shape[1])
+            row, down = _texel(y, picture.shape[0])
+            seen[n] = _mixed(picture, row, column, down, right)
+        for m in range(len(moments)):
             to, moment = sums[m], moments[m, k]
             for n in range(count):
-                to[n] += moment * brightness[n]
+                to[n] += moment * seen[n]
     return sums
 
 
-@compiled(MATRIX, CUBE, CHANNELS, REAL, REAL, REAL, MATRIX, LIGHT)
+@compiled(LIGHT, REAL, REAL, INT)
+def _near_end(spreads: Light, far: float, soft: float, size: int) -> NDArray[np.int64]:
+    """Return which of N points (M,) see more than the print, whose margin ends ``MARGIN`` beyond the black square.
+
+    ``spreads`` (5, N) as in ``_sums``, with nodes as ``far`` as that; ``soft`` is how far the picture, of ``size``
+    texels, is blurred: all in texels.
+    """
+    near, count = np.empty(spreads.shape[1], dtype=np.int64), 0
+    low = (OUTSIDE - MARGIN) / (1 + 2 * OUTSIDE) * size + soft
+    for n in range(len(near)):
+        across, down = far * spreads[2, n], far * math.sqrt(spreads[3, n] ** 2 + spreads[4, n] ** 2)
+        x, y = spreads[0, n], spreads[1, n]
+        if min(x, size - 1 - x) - across < low or min(y, size - 1 - y) - down < low:
+            near[count] = n
+            count += 1
+    return near[:count]
+
+
+@compiled(MATRIX, CUBE, LIGHT, LIGHT, REAL, REAL, REAL, LIGHT, LIGHT)
 def looks(
     template: Array,
     to_template: Array,
-    channels: Light,
+    brightness: Light,
+    beyond: Light,
     softness: float,
     texel: float,
     blur_px: float,
-    nodes: Array,
+    nodes: Light,
     moments: Light,
 ) -> Array:
-    """Return what points (N, 2) should look like (5, N): by sums over nodes (K, 2) around each, ``moments`` (6, K)."""
+    """Return what points (N, 2) should look like (5, N): by sums over nodes (K, 2) around each, ``moments`` (6, K).
+
+    ``brightness`` and ``beyond`` (H, W) are the print, and what is no longer the print, blurred by ``softness``, a
+    texel every ``texel`` template units.
+    """
     count = len(template)
     rows, spreads = np.empty((LOOKS, count)), np.empty((5, count), dtype=np.float32)
     for n in range(count):
@@ -114,7 +137,14 @@ def looks(
         spreads[0, n] = (template[n, 0] + OUTSIDE * TEMPLATE_UNITS) / texel - 0.5
         spreads[1, n] = (template[n, 1] + OUTSIDE * TEMPLATE_UNITS) / texel - 0.5
         spreads[2, n], spreads[3, n], spreads[4, n] = lxx / texel, lyx / texel, lyy / texel
-    sums = _sums(channels, spreads, nodes.astype(np.float32), moments)
+    far = 0.0
+    for k in range(len(nodes)):
+        far = max(far, math.sqrt(nodes[k, 0] ** 2 + nodes[k, 1] ** 2))
+    near = _near_end(spreads, far, SOFT_REACH * softness / texel + 1, len(beyond))
+    rows[AROUND] = 0.0
+    if len(near) > 0:
+        rows[AROUND, near] = _sums(beyond, np.ascontiguousarray(spreads[:, near]), nodes, moments[:1])[0]
+    sums = _sums(brightness, spreads, nodes, moments)
     for n in range(count):
         cxx, cxy, cyy = _covariance(to_template[n], blur_px)
         lxx, lyx, lyy = _factor(cxx, cxy, cyy, softness)
@@ -122,7 +152,7 @@ def looks(
         x, y = dxx * sums[1, n] + dyx * sums[2, n], dyy * sums[2, n]  # derivatives on the print
         mxx, mxy = dxx * dxx * cxx, dxx * (dyx * cxx + dyy * cxy)
         myy = dyx * dyx * cxx + 2 * dyx * dyy * cxy + dyy * dyy * cyy
-        rows[MEAN, n], rows[AROUND, n] = sums[0, n], sums[6, n]
+        rows[MEAN, n] = sums[0, n]
         rows[BY_X, n] = x * to_template[n, 0, 0] + y * to_template[n, 1, 0]
         rows[BY_Y, n] = x * to_template[n, 0, 1] + y * to_template[n, 1, 1]
         rows[BY_BLUR, n] = mxx * sums[3, n] + 2 * mxy * sums[4, n] + myy * sums[5, n]

@@ -13,11 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.compiled import CUBE, INDICES, INT, MATRIX, REAL, compiled
-from astratag.edges import EDGE_POINTS, EDGE_REACH, EDGES, INK_TO_PAPER
+from astratag.compiled import CUBE, FLAG_MATRIX, INDICES, INT, MATRIX, REAL, compiled
+from astratag.edges import EDGE_POINTS, EDGE_REACH, EDGES, INK_TO_PAPER, POINTS_PER_EDGE
 from astratag.geometry import CELLS, DRAWN_OFFSET, LAYERS, cell_polygons, layer_points
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 PAPER, INK = CELLS, CELLS + 1
 """Labels of what is no cell."""
@@ -57,6 +58,10 @@ def crossings(code: bytes) -> Crossings:
     kept = (np.take_along_axis(part, nearest, axis=2) for part in (distance, jump, cosine))
     d, j, c = (np.ascontiguousarray(part.transpose(2, 0, 1)) for part in kept)
     return Crossings(np.where(j != 0, d, FAR), j, c)
+
+
+UNKNOWN = Crossings(*np.zeros((3, 0, len(EDGES), POINTS_PER_EDGE)))
+"""Of a print whose code is not known: none."""
 
 
 @cache
@@ -145,21 +150,20 @@ def _sum_of_bells(
     return slope, curvature, height
 
 
-def pull(near: Crossings, edges: NDArray[np.int64], unit_px: Array, blur_px: float) -> Pull:
-    """Return what neighbours do to ``edges`` under a blur of standard deviation ``blur_px``.
+@compiled(CUBE, CUBE, CUBE, INDICES, MATRIX, REAL, FLAG_MATRIX)
+def pull(
+    distance: Array, jump: Array, cosine: Array, edges: NDArray[np.int64], unit_px: Array, blur_px: float, use: Mask
+) -> Pull:
+    """Return what neighbours, the fields of ``Crossings``, do to the points to ``use`` (E, M) of E ``edges``.
 
-    ``unit_px`` (E, M) is how large a template unit looks across the edge.  Newton's method on the sum of bells.
+    All is blurred by a standard deviation of ``blur_px``; ``unit_px`` (E, M) is how large a template unit looks across
+    the edge.  Newton's method on the sum of bells.
     """
-    return Pull(*_pull(*near, edges, unit_px, blur_px))
-
-
-@compiled(CUBE, CUBE, CUBE, INDICES, MATRIX, REAL)
-def _pull(
-    distance: Array, jump: Array, cosine: Array, edges: NDArray[np.int64], unit_px: Array, blur_px: float
-) -> tuple[Array, Array]:
-    pull_px, roundness = np.empty(unit_px.shape), np.empty(unit_px.shape)
+    pull_px, roundness = np.zeros(use.shape), np.ones(use.shape)
     for e in range(len(edges)):
-        for m in range(unit_px.shape[1]):
+        for m in range(use.shape[1]):
+            if not use[e, m]:
+                continue
             unit = unit_px[e, m] / blur_px
             slope, curvature, height = _sum_of_bells(distance, jump, cosine, edges[e], m, unit, 0.0)
             x = slope / max(curvature, LEAST_CURVATURE)
@@ -172,22 +176,19 @@ def _pull(
             believed = curvature >= LEAST_CURVATURE and height >= LEAST_CURVATURE
             pull_px[e, m] = x * blur_px if believed else np.nan
             roundness[e, m] = max(curvature, LEAST_CURVATURE)
-    return pull_px, roundness
+    return Pull(pull_px, roundness)
 
 
-def narrowing(near: Crossings, edges: NDArray[np.int64], unit_px: Array, blur_px: float) -> Array:
-    """Return how much rounder (E, M) the tops of slopes are for their height than those of edges without neighbours."""
-    return _narrowing(*near, edges, unit_px, blur_px)
-
-
-@compiled(CUBE, CUBE, CUBE, INDICES, MATRIX, REAL)
-def _narrowing(
-    distance: Array, jump: Array, cosine: Array, edges: NDArray[np.int64], unit_px: Array, blur_px: float
+@compiled(CUBE, CUBE, CUBE, INDICES, MATRIX, REAL, FLAG_MATRIX)
+def narrowing(
+    distance: Array, jump: Array, cosine: Array, edges: NDArray[np.int64], unit_px: Array, blur_px: float, use: Mask
 ) -> Array:
-    rounder = np.empty(unit_px.shape)
+    """Return how much rounder (E, M) the tops of slopes are for their height than those of edges without neighbours."""
+    rounder = np.ones(use.shape)
     for e in range(len(edges)):
-        for m in range(unit_px.shape[1]):
-            unit = unit_px[e, m] / blur_px
-            _, curvature, height = _sum_of_bells(distance, jump, cosine, edges[e], m, unit, 0.0)
-            rounder[e, m] = max(curvature, LEAST_CURVATURE) / max(height, LEAST_CURVATURE)
+        for m in range(use.shape[1]):
+            if use[e, m]:
+                unit = unit_px[e, m] / blur_px
+                _, curvature, height = _sum_of_bells(distance, jump, cosine, edges[e], m, unit, 0.0)
+                rounder[e, m] = max(curvature, LEAST_CURVATURE) / max(height, LEAST_CURVATURE)
     return rounder

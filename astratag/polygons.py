@@ -1,4 +1,4 @@
-"""Polygons: which of many contours simplify to convex quads.
+"""Polygons: how large many contours are, and which of them simplify to convex quads.
 
 Compiled, because an image has hundreds of contours, and each is simplified at several tolerances.
 """
@@ -10,14 +10,19 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.compiled import BOOL, INDICES, INT, MATRIX, REAL, VECTOR, compiled
+from astratag.compiled import BOOL, CUBE, INDICES, INT, MATRIX, REAL, VECTOR, compiled
 
 Array = NDArray[np.float64]
 
 TOLERANCES_A_SIDE = 5.0
 """How many times the tolerance the shortest side must be, or corners are moved by too much of it."""
+MOST_POINTS = 12
+"""Contours that take more points than this, before those on nearly straight lines are left out, are no quads."""
 FARTHEST_ROUNDS = 3
 """How often the point farthest from the one before is looked for, to find two that are far apart."""
+TINY = 1e-9
+LEAST_SINE = 0.1
+"""Of the angle at a quad's corner: at a sharper one its sides meet no farther out than at this."""
 
 
 @compiled(MATRIX)
@@ -75,9 +80,11 @@ def _cleaned(polygon: Array, count: int, squared: float) -> Array:
     return kept[:left].copy()
 
 
-@compiled(MATRIX, REAL)
-def simplified(contour: Array, tolerance: float) -> Array:
+@compiled(MATRIX, REAL, INT)
+def simplified(contour: Array, tolerance: float, most: int) -> Array:
     """Return the polygon (M, 2) that a closed contour (N, 2) stays within a tolerance of.
+
+    One that takes more than ``most`` points is given up: what comes back has more than a few, and means nothing.
 
     Ramer, "An iterative procedure for the polygonal approximation of plane curves", 1972; Douglas and Peucker, 1973.
     Begun, ordered and cleaned of points on nearly straight lines as OpenCV's ``approxPolyDP`` does.
@@ -113,34 +120,200 @@ def simplified(contour: Array, tolerance: float) -> Array:
         if off * off <= squared * (dx * dx + dy * dy):
             polygon[size, 0], polygon[size, 1] = x, y
             size += 1
+            if size > most:
+                return polygon[:size].copy()
         else:
             stack[top, 0], stack[top, 1], stack[top + 1, 0], stack[top + 1, 1] = at, end, begin, at
             top += 2
     return _cleaned(polygon, size, squared)
 
 
-@compiled(MATRIX, INDICES, VECTOR, VECTOR, BOOL)
+@compiled(MATRIX)
+def hull(contour: Array) -> Array:
+    """Return the convex hull (M, 2), clockwise in the image, of pixels (N, 2): whole numbers."""
+    top, bottom = int(contour[:, 1].min()), int(contour[:, 1].max())
+    rows = bottom - top + 1
+    left, right = np.full(rows, np.inf), np.full(rows, -np.inf)
+    for x, y in contour:
+        row = int(y) - top
+        left[row], right[row] = min(left[row], x), max(right[row], x)
+    around = np.empty((2 * rows, 2))
+    count = 0
+    for half in range(2):
+        first = max(count - 1, 0)
+        for step in range(rows):
+            row = rows - 1 - step if half else step
+            x, y = left[row] if half else right[row], float(row + top)
+            if abs(x) == np.inf:
+                continue
+            while count >= first + 2:
+                ax, ay = around[count - 1, 0] - around[count - 2, 0], around[count - 1, 1] - around[count - 2, 1]
+                if ax * (y - around[count - 2, 1]) - ay * (x - around[count - 2, 0]) > 0:
+                    break
+                count -= 1
+            if count == 0 or around[count - 1, 0] != x or around[count - 1, 1] != y:
+                around[count, 0], around[count, 1] = x, y
+                count += 1
+    if count > 1 and around[0, 0] == around[count - 1, 0] and around[0, 1] == around[count - 1, 1]:
+        count -= 1
+    return around[:count].copy()
+
+
+@compiled(MATRIX)
+def _length(polygon: Array) -> float:
+    """Return the perimeter of a polygon (N, 2)."""
+    length, before = 0.0, polygon[-1]
+    for point in polygon:
+        length += math.hypot(point[0] - before[0], point[1] - before[1])
+        before = point
+    return length
+
+
+@compiled(MATRIX, REAL, VECTOR, BOOL)
+def _convex_quad(contour: Array, perimeter: float, tolerances: Array, whole: bool) -> Array:
+    """Return the convex quad (4, 2) that a contour (N, 2) simplifies to, else an empty one (0, 2); see below."""
+    best, finest, too_fine, too_coarse = np.empty((0, 2)), np.inf, 0.0, np.inf
+    for tolerance in tolerances:
+        if not too_fine < tolerance < too_coarse:
+            continue
+        polygon = simplified(contour, tolerance * perimeter, MOST_POINTS)
+        if len(polygon) > MOST_POINTS:
+            too_fine = tolerance
+        elif len(polygon) < 4:
+            too_coarse = tolerance
+        if len(polygon) != 4 or not _convex(polygon):
+            continue
+        bearable = whole or _shortest(polygon) >= TOLERANCES_A_SIDE * tolerance * perimeter
+        if bearable or tolerance < finest:
+            best, finest = polygon, tolerance
+        if bearable:
+            break
+    return best
+
+
+@compiled(MATRIX, INDICES, VECTOR, VECTOR, BOOL, INT)
 def convex_quads(
-    points: Array, starts: NDArray[np.int64], perimeters: Array, tolerances: Array, whole: bool
+    points: Array, starts: NDArray[np.int64], perimeters: Array, tolerances: Array, whole: bool, most_hulls: int
 ) -> tuple[NDArray[np.bool_], Array]:
     """Return which contours simplify to a convex quad (N,) at a tolerance that its sides bear, and the quads (N, 4, 2).
 
-    Contour i runs through ``points`` (P, 2) from ``starts`` (N + 1,) i on.  ``tolerances`` are fractions of perimeters.
-    One not much smaller than a skinny quad's short sides moves its corners along the long ones: the first that is
-    small enough counts, or the first at all of a ``whole`` square; else the finest that gives a quad.
+    Else their hulls, of the first ``most_hulls`` that do not.  Contour i runs through ``points`` (P, 2) from ``starts``
+    (N + 1,) i on.  ``tolerances`` are fractions of perimeters.  One not much smaller than a skinny quad's short sides
+    moves its corners along the long ones: the first that is small enough counts, or the first at all of a ``whole``
+    square; else the finest that gives a quad.
     """
     count = len(perimeters)
-    found, quads = np.zeros(count, dtype=np.bool_), np.zeros((count, 4, 2))
+    found, quads, hulls = np.zeros(count, dtype=np.bool_), np.zeros((count, 4, 2)), 0
     for i in range(count):
-        contour, finest = points[starts[i] : starts[i + 1]], np.inf
-        for tolerance in tolerances:
-            polygon = simplified(contour, tolerance * perimeters[i])
-            if len(polygon) != 4 or not _convex(polygon):
-                continue
-            bearable = whole or _shortest(polygon) >= TOLERANCES_A_SIDE * tolerance * perimeters[i]
-            if bearable or tolerance < finest:
-                found[i], finest = True, tolerance
-                quads[i] = polygon
-            if bearable:
-                break
+        contour = points[starts[i] : starts[i + 1]]
+        quad = _convex_quad(contour, perimeters[i], tolerances, whole)
+        if len(quad) == 0 and hulls < most_hulls:
+            hulls += 1
+            around = hull(contour)
+            if 4 <= len(around) < len(contour):
+                quad = _convex_quad(around, _length(around), tolerances, whole)
+        if len(quad) > 0:
+            found[i], quads[i] = True, quad
     return found, quads
+
+
+@compiled(MATRIX, REAL)
+def grown(quad: Array, outset: float) -> Array:
+    """Return a clockwise quad (4, 2) with each side moved out."""
+    along, at = np.empty((4, 2)), np.empty((4, 2))
+    for i in range(4):
+        dx, dy = quad[(i + 1) % 4, 0] - quad[i, 0], quad[(i + 1) % 4, 1] - quad[i, 1]
+        length = max(math.sqrt(dx * dx + dy * dy), TINY)
+        along[i, 0], along[i, 1] = dx / length, dy / length
+    for i in range(4):
+        sine = along[i - 1, 0] * along[i, 1] - along[i - 1, 1] * along[i, 0]
+        for axis in range(2):
+            at[i, axis] = quad[i, axis] + outset * (along[i - 1, axis] - along[i, axis]) / max(sine, LEAST_SINE)
+    return at
+
+
+@compiled(CUBE, REAL, REAL)
+def clockwise(quads: Array, least_side: float, outset: float) -> Array:
+    """Return quads (Q, 4, 2) clockwise and each side moved out, without those that have a shorter side."""
+    kept, count = np.empty(quads.shape), 0
+    for q in range(len(quads)):
+        quad = quads[q]
+        if _shortest(quad) < least_side:
+            continue
+        across = (quad[2, 0] - quad[0, 0]) * (quad[3, 1] - quad[1, 1])
+        turned = across < (quad[2, 1] - quad[0, 1]) * (quad[3, 0] - quad[1, 0])
+        for i in range(4):
+            kept[count, i] = quad[3 - i if turned else i]
+        kept[count] = grown(kept[count], outset)
+        count += 1
+    return kept[:count].copy()
+
+
+@compiled(MATRIX)
+def _turns(polygon: Array) -> Array:
+    """Return by how many radians a polygon (N, 2) turns clockwise in the image at each point (N,)."""
+    count = len(polygon)
+    turns = np.empty(count)
+    for i in range(count):
+        before, after = polygon[i] - polygon[i - 1], polygon[(i + 1) % count] - polygon[i]
+        turns[i] = math.atan2(before[0] * after[1] - before[1] * after[0], before[0] * after[0] + before[1] * after[1])
+    return turns
+
+
+@compiled(MATRIX, MATRIX)
+def _bulge(contour: Array, corners: Array) -> tuple[Array, Array]:
+    """Return four points of a clockwise contour (N, 2) in its order, and the bulges (4, 2) of the sides between.
+
+    How far, outwards, the middle of the parabola lies that fits a side best.
+    """
+    count, places = len(contour), np.zeros(4, dtype=np.int64)
+    for i in range(4):
+        while contour[places[i], 0] != corners[i, 0] or contour[places[i], 1] != corners[i, 1]:
+            places[i] += 1
+    places.sort()
+    ordered, bulges = contour[places], np.empty((4, 2))
+    for i in range(4):
+        dx, dy = ordered[(i + 1) % 4] - ordered[i]
+        chord = math.hypot(dx, dy)
+        off, weight = 0.0, 0.5
+        for k in range(places[i], places[i + 1] if i < 3 else places[0] + count):
+            x, y = contour[k % count] - ordered[i]
+            along = (x * dx + y * dy) / (chord * chord)
+            profile = 4 * along * (1 - along)
+            off += profile * (x * dy - y * dx) / chord
+            weight += profile * profile
+        bulges[i, 0], bulges[i, 1] = off / weight * dy / chord, -off / weight * dx / chord
+    return ordered, bulges
+
+
+@compiled(MATRIX, INDICES, VECTOR, REAL, INT, REAL, REAL, REAL)
+def bent_quads(
+    points: Array,
+    starts: NDArray[np.int64],
+    perimeters: Array,
+    tolerance: float,
+    most_vertices: int,
+    least_turn: float,
+    least_side: float,
+    outset: float,
+) -> tuple[NDArray[np.bool_], Array, Array]:
+    """Return which counter-clockwise contours have four corners (N,), these (N, 4, 2), and the sides' bulges (N, 4, 2).
+
+    Contours are given as to ``convex_quads``.  Simplified to 4 to ``most_vertices`` points, the four where they turn
+    most are corners; the sides between these are moved out.
+    """
+    count = len(perimeters)
+    found, corners, bulges = np.zeros(count, dtype=np.bool_), np.zeros((count, 4, 2)), np.zeros((count, 4, 2))
+    for i in range(count):
+        contour = points[starts[i] : starts[i + 1]]
+        polygon = simplified(contour, tolerance * perimeters[i], 2 * most_vertices)[::-1].copy()
+        if not 4 <= len(polygon) <= most_vertices:
+            continue
+        turns = _turns(polygon)
+        sharpest = np.sort(np.argsort(-turns, kind="mergesort")[:4])
+        four = polygon[sharpest]
+        if turns[sharpest].min() >= least_turn and _shortest(four) >= least_side:
+            found[i] = True
+            ordered, bulges[i] = _bulge(contour[::-1].copy(), four)
+            corners[i] = grown(ordered, outset)
+    return found, corners, bulges

@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from astratag.camera import Camera, pixel
-from astratag.compiled import CUBE, MATRIX, REAL, VECTOR, compiled
+from astratag.compiled import BOOL, CUBE, INT, MATRIX, REAL, VECTOR, compiled
 from astratag.detection import LayerDetection, PlanarPose
 from astratag.geometry import SQUARES
+from astratag.ippe import plane_poses
 from astratag.normal import dot, factored, inverse
 from astratag.surface import Surface
-from astratag.transforms import perturbed, pose
-from astratag.warp import PoseWarp, on_surface, pose_jacobian, seen_from
+from astratag.transforms import perturbed
+from astratag.warp import PoseWarp, in_camera, on_surface, pose_jacobian, seen_from
 
 Array = NDArray[np.float64]
 
-REFINEMENT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 6, 1e-8)
-MAX_STEPS = 30
+FEW_STEPS, MAX_STEPS = 6, 30
+"""Steps that refine one of two poses: near to where one explains what is seen, further ones would lead it to the other.
+And those that refine the pose."""
 NEAREST_M = 1e-6
 """A point behind the camera is taken for one so near: far outside every image."""
 HOPELESS_RATIO, HOPELESS_RMS_PX = 10.0, 1.0
@@ -53,25 +55,14 @@ def poses_from_square(
     surface the plane is the one through its corners.
     Collins and Bartoli, "Infinitesimal plane-based pose estimation", IJCV 2014.
     """
-    points_marker = on_surface(surface, side_m, template)[0].T
-    behind_m = points_marker[:, 2].mean()
-    in_plane = points_marker * (1.0, 1.0, 0.0)
-    rays = camera.undistort(corners_px)
-    if not np.isfinite(rays).all():
-        return []
-    try:
-        _, rotations, translations, _ = cv2.solvePnPGeneric(
-            in_plane, rays.reshape(-1, 1, 2), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-        )
-    except cv2.error:  # corners almost on one line
-        return []
-    poses = []
-    for rotation, translation in zip(rotations, translations, strict=True):
-        R_cam_marker = cv2.Rodrigues(rotation)[0]
-        t_cam_marker_m = translation.ravel() - R_cam_marker[:, 2] * behind_m
-        if np.isfinite(R_cam_marker).all() and np.isfinite(t_cam_marker_m).all() and t_cam_marker_m[2] > 0:
-            poses.append(pose(R_cam_marker, t_cam_marker_m))
-    return poses
+    points_marker = on_surface(surface, side_m, template)[0]
+    behind_m = points_marker[2].mean()
+    found = []
+    for T_cam_plane in plane_poses(np.ascontiguousarray(points_marker[:2].T), camera.undistort(corners_px)):
+        T_cam_plane[:3, 3] -= T_cam_plane[:3, 2] * behind_m
+        if np.isfinite(T_cam_plane).all() and T_cam_plane[2, 3] > 0:
+            found.append(T_cam_plane)
+    return found
 
 
 def planar_poses(
@@ -98,21 +89,13 @@ def planar_poses(
     if not starts:
         return ()
     points_marker = on_surface(surface, side_m, corners)[0]
-    squared_px = _squared_errors(np.array(starts), points_marker, corners_px, camera.lens)
-    rms_px = np.sqrt(squared_px.mean(axis=1))
-    hopeless_px = max(HOPELESS_RMS_PX, HOPELESS_RATIO * min(rms_px))
-    refine = [start is not known and rms <= hopeless_px for start, rms in zip(starts, rms_px.tolist(), strict=True)]
-    poses = [
-        _refined(camera, start, points_marker, corners_px) if worth else start
-        for start, worth in zip(starts, refine, strict=True)
-    ]
-    if any(refine):
-        squared_px = _squared_errors(np.array(poses), points_marker, corners_px, camera.lens)
-        rms_px = np.sqrt(squared_px.mean(axis=1))
-    misfit = squared_px @ np.repeat([seen.sigma_px**-2 for seen in layers], 4)
-    likely = np.exp(-0.5 * (misfit - misfit.min()))
-    found = zip(poses, rms_px.tolist(), (likely / likely.sum()).tolist(), strict=True)
-    return tuple(sorted((PlanarPose(*one) for one in found), key=lambda planar: -planar.probability))
+    sigma_px = np.repeat([seen.sigma_px for seen in layers], 4)
+    lens = camera.lens
+    poses, *told = _explaining(np.array(starts), known is not None, points_marker, corners_px, sigma_px, lens)
+    given = [known, *poses[1:]] if known is not None else list(poses)
+    found = [PlanarPose(*one) for one in zip(given, *(each.tolist() for each in told), strict=True)]
+    seen = (planar for planar in found if math.isfinite(planar.reprojection_rms_px))
+    return tuple(sorted(seen, key=lambda planar: -planar.probability))
 
 
 @compiled(MATRIX)
@@ -139,38 +122,15 @@ def template_of_layers(layers: tuple[int, ...]) -> Array:
     return corners
 
 
-@compiled(CUBE, MATRIX, MATRIX, VECTOR)
-def _squared_errors(poses: Array, points_marker: Array, seen_px: Array, lens: Array) -> Array:
-    """Return how far points (3, N) of the marker are from where they are seen (N, 2) under P poses: (P, N) px^2."""
-    squared_px = np.empty((len(poses), len(seen_px)))
-    for p in range(len(poses)):
-        T = poses[p]
-        for i in range(len(seen_px)):
-            x, y, z = points_marker[0, i], points_marker[1, i], points_marker[2, i]
-            depth = max(T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3], NEAREST_M)
-            right = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
-            u, v = pixel(right, T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3], depth, lens)
-            squared_px[p, i] = (u - seen_px[i, 0]) ** 2 + (v - seen_px[i, 1]) ** 2
+@compiled(MATRIX, MATRIX, MATRIX, VECTOR)
+def _squared_errors(T: Array, points_marker: Array, seen_px: Array, lens: Array) -> Array:
+    """Return how far points (3, N) of the marker are from where they are seen (N, 2) under a pose: (N,) px^2."""
+    squared_px = np.empty(len(seen_px))
+    for i in range(len(seen_px)):
+        x, y, z = in_camera(T, points_marker[0, i], points_marker[1, i], points_marker[2, i])
+        u, v = pixel(x, y, max(z, NEAREST_M), lens)
+        squared_px[i] = (u - seen_px[i, 0]) ** 2 + (v - seen_px[i, 1]) ** 2
     return squared_px
-
-
-def _refined(camera: Camera, T_cam_marker: Array, points_marker: Array, seen_px: Array) -> Array:
-    """Return a pose refined on points (3, N) of the marker seen at (N, 2) pixels; as it was where that fails.
-
-    In few steps: near to where one pose explains what is seen, further ones would lead the other to it.
-    """
-    rotation, translation = cv2.solvePnPRefineLM(
-        np.ascontiguousarray(points_marker.T),
-        seen_px,
-        camera.K,
-        camera.distortion,
-        cv2.Rodrigues(T_cam_marker[:3, :3])[0],
-        T_cam_marker[:3, 3:].copy(),
-        REFINEMENT,
-    )
-    if not np.isfinite(rotation).all() or translation[2, 0] <= 0:
-        return T_cam_marker
-    return pose(cv2.Rodrigues(rotation)[0], translation)
 
 
 def refine_on_corners(start: PoseWarp, layers: Sequence[LayerDetection]) -> CornerPose:
@@ -225,14 +185,17 @@ def _damped_inverse(normal: Array, damping: float) -> Array:
     return undamped
 
 
-@compiled(MATRIX, MATRIX, MATRIX, VECTOR, VECTOR)
-def _adjusted(
-    T_cam_marker: Array, points_marker: Array, seen_px: Array, sigma_px: Array, lens: Array
+@compiled(MATRIX, MATRIX, MATRIX, VECTOR, VECTOR, INT)
+def _nearest(
+    T_cam_marker: Array, points_marker: Array, seen_px: Array, sigma_px: Array, lens: Array, most_steps: int
 ) -> tuple[Array, Array, float]:
-    """Return the pose nearest to points (3, N) seen at (N, 2) within ``sigma_px`` (N,), its covariance, and RMS."""
+    """Return the pose nearest to points (3, N) seen at (N, 2), its normal matrix (6, 6) and squared error, in sigmas.
+
+    Levenberg and Marquardt's, begun at a pose.
+    """
     T, damping, step = T_cam_marker.copy(), FIRST_DAMPING, np.empty(6)
     normal, right, squared = _normal_equations(T, points_marker, seen_px, sigma_px, lens)
-    for _ in range(MAX_STEPS):
+    for _ in range(most_steps):
         by_right = _damped_inverse(normal, damping)
         for p in range(6):
             step[p] = dot(by_right[p], right)
@@ -247,11 +210,43 @@ def _adjusted(
         T, damping, normal, right, squared = moved, damping / 10, next_normal, next_right, next_squared
         if gain <= CONVERGED_PX2 * (1 + squared):
             break
+    return T, normal, squared
+
+
+@compiled(MATRIX, MATRIX, MATRIX, VECTOR, VECTOR)
+def _adjusted(
+    T_cam_marker: Array, points_marker: Array, seen_px: Array, sigma_px: Array, lens: Array
+) -> tuple[Array, Array, float]:
+    """Return the pose nearest to points (3, N) seen at (N, 2) within ``sigma_px`` (N,), its covariance, and RMS."""
+    T, normal, squared = _nearest(T_cam_marker, points_marker, seen_px, sigma_px, lens, MAX_STEPS)
     covariance, misfit = _damped_inverse(normal, UNSEEN), max(1.0, squared / max(2 * len(seen_px) - 6, 1))
     for p in range(6):
         for q in range(6):
             covariance[p, q] *= misfit
-    at, squared_px = seen_from(points_marker, T, lens, 0.0), 0.0
-    for i in range(len(seen_px)):
-        squared_px += (seen_px[i, 0] - at[i, 0]) ** 2 + (seen_px[i, 1] - at[i, 1]) ** 2
-    return T, covariance, np.sqrt(squared_px / len(seen_px))
+    return T, covariance, math.sqrt(_squared_errors(T, points_marker, seen_px, lens).mean())
+
+
+@compiled(CUBE, BOOL, MATRIX, MATRIX, VECTOR, VECTOR)
+def _explaining(
+    starts: Array, known: bool, points_marker: Array, seen_px: Array, sigma_px: Array, lens: Array
+) -> tuple[Array, Array, Array]:
+    """Return P poses refined on points (3, N) seen at (N, 2), the RMS misfit of each (P,), and its probability (P,).
+
+    Unless the first is ``known``; and one that explains the points far worse than the other is left as it was.
+    """
+    count, poses = len(starts), starts.copy()
+    rms_px, misfit, even = np.empty(count), np.empty(count), np.ones(len(seen_px))
+    for p in range(count):
+        rms_px[p] = math.sqrt(_squared_errors(poses[p], points_marker, seen_px, lens).mean())
+    hopeless_px = max(HOPELESS_RMS_PX, HOPELESS_RATIO * rms_px.min())
+    for p in range(count):
+        if not (known and p == 0) and rms_px[p] <= hopeless_px:
+            refined = _nearest(starts[p], points_marker, seen_px, even, lens, FEW_STEPS)[0]
+            if np.isfinite(refined).all() and refined[2, 3] > 0:
+                poses[p] = refined
+        squared_px = _squared_errors(poses[p], points_marker, seen_px, lens)
+        rms_px[p], misfit[p] = math.sqrt(squared_px.mean()), (squared_px / sigma_px**2).sum()
+        if not math.isfinite(misfit[p]):
+            rms_px[p] = misfit[p] = np.inf
+    likely = np.exp(-0.5 * (misfit - misfit.min()))
+    return poses, rms_px, likely / likely.sum()

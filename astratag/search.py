@@ -5,8 +5,7 @@ Pixels: (0, 0) is the centre of the top-left pixel.  Corners run clockwise in th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -14,13 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.binarise import threshold_blocks
-from astratag.polygons import convex_quads
+from astratag.binarise import NO_CONTOURS, Contours, sums_of, threshold_blocks, traced
+from astratag.polygons import bent_quads, clockwise, convex_quads, hull, simplified
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
-Contour = NDArray[np.int32]
-"""Pixels (N, 1, 2) along the border of a shape."""
 
 
 class Binarisation(NamedTuple):
@@ -89,7 +86,6 @@ MAX_HULLS, MAX_CUT = 120, 12
 """
 OUTSET_PX, INSET_PX = 0.75, -0.5
 """Contours run through the centres of the outermost ink pixels, or of the white pixels beside a hole."""
-LEAST_SINE = 0.1
 BORDER_PX = 1
 """Outlines this near to the image's border are cut by it."""
 
@@ -98,15 +94,17 @@ BORDER_PX = 1
 class Outlines:
     """Plausible contours, the longest first, and what takes their coordinates to the whole image's pixels."""
 
-    contours: list[tuple[float, Contour]]
+    contours: Contours
     scale: float
     origin: Array
     outset_px: float
     """How far out of the contour the square's edge lies, in the contour's own pixels."""
     size: tuple[int, int] = (0, 0)
     """Width and height of the image they were found in, in their own pixels."""
-    others: Sequence[Contour] = ()
-    """All contours, also those around holes, or too ragged or open for a square."""
+    others: Contours = NO_CONTOURS
+    """All that are long enough, also those around holes, or too ragged or open for a square."""
+    followed: int = 0
+    """How many pixels all borders in the image have."""
 
     def moved(self, origin: Array) -> Outlines:
         """Return the outlines of a part of an image whose first pixel is at ``origin`` (2,)."""
@@ -127,7 +125,7 @@ class Outlines:
         return _bent_quads(self)
 
 
-NONE = Outlines(contours=[], scale=1.0, origin=np.zeros(2), outset_px=0.0)
+NONE = Outlines(contours=NO_CONTOURS, scale=1.0, origin=np.zeros(2), outset_px=0.0)
 
 
 class BentQuads(NamedTuple):
@@ -137,12 +135,36 @@ class BentQuads(NamedTuple):
     bulges_px: Array
 
 
-class Scaled(NamedTuple):
-    """An image at another resolution, and which blocks (R, C) of it outlines are looked for in; None is everywhere."""
+@dataclass(frozen=True, eq=False)
+class Scaled:
+    """An image at another resolution, and which blocks (R, C) of it outlines are looked for in; None is everywhere.
+
+    ``kept`` holds it smoothed over so many pixels, and its sums, for all that need them.
+    """
 
     gray: Image
     worth: NDArray[np.bool_] | None = None
     block_px: int = BLOCK_PX
+    kept: dict[int, tuple[Image, NDArray[np.int32]]] = field(default_factory=dict)
+
+    def smoothed(self, smooth_px: int) -> tuple[Image, NDArray[np.int32]]:
+        """Return the image averaged over so many pixels, and its sums."""
+        if smooth_px not in self.kept:
+            smooth = cv2.blur(self.gray, (smooth_px, smooth_px)) if smooth_px > 1 else self.gray
+            self.kept[smooth_px] = smooth, sums_of(smooth)
+        return self.kept[smooth_px]
+
+    @property
+    def blocks(self) -> tuple[NDArray[np.bool_], int]:
+        """Return which blocks (R, C) are worth it, and how large they are: one for all where everything is."""
+        if self.worth is None:
+            return np.ones((1, 1), dtype=bool), max(self.gray.shape)
+        return self.worth, self.block_px
+
+    @property
+    def looked_at_px(self) -> int:
+        """Return how many pixels are worth it, about."""
+        return self.gray.size if self.worth is None else int(self.worth.sum()) * self.block_px**2
 
 
 def scaled(gray: Image, scale: float) -> Scaled:
@@ -159,27 +181,24 @@ def find_outlines(gray: Image, how: Binarisation = PLAIN, image: Scaled | None =
 
     ``image`` is what ``scaled`` makes of the gray one, if that is known.
     """
-    gray, worth, block_px = scaled(gray, how.scale) if image is None else image
-    smooth = cv2.blur(gray, (how.smooth_px,) * 2) if how.smooth_px > 1 else gray
-    if worth is None:
-        kind, offset = (cv2.THRESH_BINARY, -how.offset) if how.holes else (cv2.THRESH_BINARY_INV, how.offset)
-        shapes = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, kind, how.window_px, offset)
-        looked_at = shapes.size
-    else:
-        shapes = threshold_blocks(smooth, worth, block_px, how.window_px, how.offset, how.holes)
-        looked_at = int(worth.sum()) * block_px**2
-    changes = cv2.countNonZero(cv2.absdiff(shapes[:, 1:], shapes[:, :-1]))
-    noisy = how.scale * changes > NOISE * looked_at  # hundreds of thousands of contours, and none of them a square
-    contours = () if noisy else cv2.findContours(shapes, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)[0]
+    image = image or scaled(gray, how.scale)
+    smooth, sums = image.smoothed(how.smooth_px)
+    worth, block_px = image.blocks
+    shapes, changes = threshold_blocks(smooth, sums, worth, block_px, how.window_px, how.offset, how.holes)
+    contours, followed = NO_CONTOURS, 0
+    if how.scale * changes <= NOISE * image.looked_at_px:  # else thousands of contours, and none of them a square
+        points, starts, areas, perimeters, followed = traced(shapes, MIN_PERIMETER_PX)
+        contours = Contours(points, starts, areas, perimeters)
     if how.holes:
-        contours = [contour[::-1] for contour in contours]  # holes are run around the other way
+        contours = contours.run_backwards()
     return Outlines(
         contours=_plausible(contours),
         scale=1 / how.scale,
         origin=np.zeros(2),
         outset_px=INSET_PX if how.holes else OUTSET_PX,
-        size=(shapes.shape[1], shapes.shape[0]),
+        size=(smooth.shape[1], smooth.shape[0]),
         others=contours,
+        followed=followed,
     )
 
 
@@ -192,7 +211,7 @@ def _worth_a_fine_look(gray: Image) -> NDArray[np.bool_] | None:
     step = cv2.copyMakeBorder(
         step, 0, rows * BLOCK_PX - len(gray), 0, columns * BLOCK_PX - gray.shape[1], cv2.BORDER_CONSTANT
     )
-    largest = step.reshape(rows, BLOCK_PX, columns, BLOCK_PX).max(axis=(1, 3))
+    largest = step.reshape(rows, BLOCK_PX, -1).max(axis=1).reshape(rows, columns, BLOCK_PX).max(axis=2)
     near = cv2.dilate(largest, np.ones((3, 3), np.uint8))
     fine = np.zeros(near.size, dtype=bool)
     fine[np.argsort(-near.ravel().astype(int), kind="stable")[: FINE_PX // BLOCK_PX**2]] = True
@@ -218,68 +237,42 @@ def bent_quads_of(outlines: Outlines) -> BentQuads:
 
 
 def _quads(outlines: Outlines, *, whole: bool) -> Array:
-    contours = [contour for _, contour in outlines.contours]
-    if not contours:
+    contours = outlines.contours
+    if not contours.count:
         return np.zeros((0, 4, 2))
-    perimeters = np.array([perimeter for perimeter, _ in outlines.contours])
-    found, quads = _simplified_to_quads(contours, perimeters, whole)
+    found, quads = convex_quads(
+        contours.points, contours.starts, contours.perimeters, _tolerances(whole), whole, 0 if whole else MAX_HULLS
+    )
     for i in np.flatnonzero(_cut(outlines))[:MAX_CUT].tolist() if not whole else ():
-        uncut = _uncut(contours[i], perimeters[i], outlines.size)
+        uncut = _uncut(contours.contour(i), contours.perimeters[i], outlines.size)
         if uncut is not None:
-            found[i], quads[i] = True, uncut[:, 0]
-    quads = quads[found]
-    turned = _cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1]) < 0
-    quads[turned] = quads[turned, ::-1]
-    quads = quads[_squared(quads[:, [1, 2, 3, 0]] - quads).min(axis=1) >= MIN_SIDE_PX**2]
-    return outlines.in_image(_grown(quads, outlines.outset_px))
+            found[i], quads[i] = True, uncut
+    return outlines.in_image(clockwise(quads[found], MIN_SIDE_PX, outlines.outset_px))
 
 
 def _bent_quads(outlines: Outlines) -> BentQuads:
-    contours, polygons = [], []
-    for perimeter, contour in outlines.contours[:MAX_BENT_OUTLINES]:
-        polygon = cv2.approxPolyDP(contour, BENT_TOLERANCE * perimeter, True)
-        if 4 <= len(polygon) <= MAX_VERTICES:
-            contours.append(contour[::-1])  # contours around ink run counter-clockwise in the image
-            polygons.append(polygon[::-1])
-    if not contours:
-        return BentQuads(*np.zeros((2, 0, 4, 2)))
-    corners, sharp = _sharpest(polygons)
-    sharp &= _squared(corners[:, [1, 2, 3, 0]] - corners).min(axis=1) >= MIN_SIDE_PX**2
-    corners, contours = corners[sharp], [contours[i] for i in np.flatnonzero(sharp)]
-    if not contours:
-        return BentQuads(*np.zeros((2, 0, 4, 2)))
-    corners, bulges = _bulging(contours, corners)
-    return BentQuads(outlines.in_image(_grown(corners, outlines.outset_px)), outlines.scale * bulges)
+    contours = outlines.contours.first(MAX_BENT_OUTLINES)
+    found, corners, bulges = bent_quads(
+        contours.points,
+        contours.starts,
+        contours.perimeters,
+        BENT_TOLERANCE,
+        MAX_VERTICES,
+        LEAST_TURN,
+        MIN_SIDE_PX,
+        outlines.outset_px,
+    )
+    return BentQuads(outlines.in_image(corners[found]), outlines.scale * bulges[found])
 
 
-def _plausible(contours: Sequence[Contour]) -> list[tuple[float, Contour]]:
-    """Return perimeters and contours, the longest first, of those that may be a square's: at most ``MAX_CONTOURS``.
+def _plausible(contours: Contours) -> Contours:
+    """Return the contours that may be a square's, the longest first: at most ``MAX_CONTOURS``.
 
-    They run around ink, are long enough, and not too ragged.
+    They run around ink, and are not too ragged.
     """
-    contours = [contour for contour in contours if len(contour) >= 4]
-    if not contours:
-        return []
-    area, perimeter = _sizes(contours)
-    use = (area >= MIN_SIDE_PX**2) & (perimeter >= MIN_PERIMETER_PX) & (area >= LEAST_ROUNDNESS * perimeter**2)
-    longest = np.flatnonzero(use)[np.argsort(-perimeter[use], kind="stable")[:MAX_CONTOURS]]
-    return [(float(perimeter[i]), contours[i]) for i in longest]
-
-
-def _sizes(contours: Sequence[Contour]) -> tuple[Array, Array]:
-    """Return the areas, negative of holes, and the perimeters (N,) of contours."""
-    starts = starts_of(contours)
-    points = np.concatenate(contours)[:, 0].astype(float)
-    after = np.roll(points, -1, axis=0)
-    after[np.append(starts[1:], len(points)) - 1] = points[starts]  # each contour ends where it began
-    area = np.add.reduceat(_cross(after, points), starts) / 2
-    return area, np.add.reduceat(np.sqrt(_squared(after - points)), starts)
-
-
-def starts_of(parts: Sequence[Contour]) -> NDArray[np.int64]:
-    """Return where each of several arrays (N,) begins once they are concatenated."""
-    lengths = np.fromiter(map(len, parts), np.int64, len(parts))
-    return np.cumsum(lengths) - lengths
+    area, perimeter = contours.areas, contours.perimeters
+    use = (area >= MIN_SIDE_PX**2) & (area >= LEAST_ROUNDNESS * perimeter**2)
+    return contours.chosen(np.flatnonzero(use)[np.argsort(-perimeter[use], kind="stable")[:MAX_CONTOURS]])
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -292,56 +285,21 @@ def _squared(a: Array) -> Array:
     return a[..., 0] * a[..., 0] + a[..., 1] * a[..., 1]
 
 
-def _grown(quads: Array, outset_px: float) -> Array:
-    """Return quads (Q, 4, 2) with each side moved out."""
-    ahead = quads[:, [1, 2, 3, 0]] - quads
-    along = ahead / np.maximum(np.sqrt(_squared(ahead)), 1e-9)[..., None]
-    before = along[:, [3, 0, 1, 2]]
-    return quads + outset_px * (before - along) / np.maximum(_cross(before, along), LEAST_SINE)[..., None]
-
-
-def _simplified_to_quads(
-    contours: Sequence[Contour], perimeters: Array, whole: bool
-) -> tuple[NDArray[np.bool_], Array]:
-    """Return which contours simplify to a convex quad (N,), and these quads (N, 4, 2).
-
-    Else those of their hulls, unless only a ``whole`` square will do.
-    """
-    found, quads = convex_quads(*_joined(contours), perimeters, _tolerances(whole), whole)
-    if whole:
-        return found, quads
-    hulls = {i: cv2.convexHull(contours[i]) for i in np.flatnonzero(~found)[:MAX_HULLS].tolist()}
-    rest = [i for i, hull in hulls.items() if 4 <= len(hull) < len(contours[i])]
-    if rest:
-        around = [hulls[i] for i in rest]
-        lengths = np.array([cv2.arcLength(hull, True) for hull in around])
-        found[rest], quads[rest] = convex_quads(*_joined(around), lengths, _tolerances(False), False)
-    return found, quads
-
-
 def _tolerances(whole: bool) -> Array:
     return np.array(POLYGON_TOLERANCES[: WHOLE_TOLERANCES if whole else None])
 
 
-def _joined(contours: Sequence[Contour]) -> tuple[Array, NDArray[np.int64]]:
-    """Return the points (P, 2) of contours one after another, and where each begins, and the last ends (N + 1,)."""
-    return np.concatenate(contours)[:, 0].astype(float), np.append(starts_of(contours), sum(map(len, contours)))
-
-
 def _cut(outlines: Outlines) -> NDArray[np.bool_]:
     """Return which outlines touch the border of the image they were found in."""
-    contours = [contour for _, contour in outlines.contours]
-    if not contours:
-        return np.zeros(0, dtype=bool)
-    points, starts = np.concatenate(contours)[:, 0], starts_of(contours)
+    points, starts = outlines.contours.points, outlines.contours.starts[:-1]
     low, high = np.minimum.reduceat(points, starts), np.maximum.reduceat(points, starts)
     last = np.array(outlines.size) - 1
     return np.asarray((low <= BORDER_PX).any(axis=1) | (high >= last - BORDER_PX).any(axis=1))
 
 
-def _uncut(contour: Contour, perimeter: float, size: tuple[int, int]) -> Array | None:
-    """Return the convex quad (4, 1, 2) that the border of an image of a size cut corners off; None if it cut none."""
-    polygon = cv2.approxPolyDP(cv2.convexHull(contour), BENT_TOLERANCE * perimeter, True)[:, 0].astype(float)
+def _uncut(contour: Array, perimeter: float, size: tuple[int, int]) -> Array | None:
+    """Return the convex quad (4, 2) that the border of an image of a size cut corners off; None if it cut none."""
+    polygon = simplified(hull(contour), BENT_TOLERANCE * perimeter, MAX_VERTICES)
     after = np.roll(polygon, -1, axis=0)
     near_low = np.maximum(polygon, after) <= BORDER_PX
     near_high = np.minimum(polygon, after) >= np.array(size) - 1 - BORDER_PX
@@ -353,42 +311,4 @@ def _uncut(contour: Contour, perimeter: float, size: tuple[int, int]) -> Array |
     turn = _cross(before, along)
     if not ((turn > 0).all() or (turn < 0).all()):
         return None
-    return (start + before * (_cross(polygon[sides] - start, along) / turn)[:, None])[:, None]
-
-
-def _sharpest(polygons: Sequence[Contour]) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the four vertices of each polygon (N, 1, 2) that turn most (B, 4, 2), and which turn enough (B,)."""
-    lengths = np.array([len(polygon) for polygon in polygons])
-    rows, column = np.arange(len(polygons))[:, None], np.arange(MAX_VERTICES)
-    vertices = np.zeros((len(polygons), MAX_VERTICES, 2))
-    vertices[column < lengths[:, None]] = np.concatenate(polygons)[:, 0]
-    after = vertices[rows, np.where(column + 1 < lengths[:, None], column + 1, 0)] - vertices
-    before = vertices - vertices[rows, np.where(column > 0, column - 1, lengths[:, None] - 1)]
-    turn = np.arctan2(_cross(before, after), (before * after).sum(axis=2))
-    turn[column >= lengths[:, None]] = -np.inf
-    order = np.argsort(-turn, axis=1, kind="stable")[:, :4]
-    return vertices[rows, np.sort(order, axis=1)], turn[rows[:, 0], order[:, 3]] >= LEAST_TURN
-
-
-def _bulging(contours: Sequence[Contour], corners: Array) -> tuple[Array, Array]:
-    """Return four corners (B, 4, 2) on each contour, and the bulges (B, 4, 2) of the sides between, as parabolas."""
-    points = np.concatenate(contours)[:, 0].astype(float)
-    lengths = np.array([len(contour) for contour in contours])
-    owner, starts = np.repeat(np.arange(len(contours)), lengths), np.cumsum(lengths) - lengths
-    apart = _squared(points[:, None] - corners[owner])
-    at_corner = apart == np.minimum.reduceat(apart, starts)[owner]
-    place = np.where(at_corner, np.arange(len(points))[:, None], len(points))
-    places = np.minimum.reduceat(place, starts)
-    order = np.argsort(places, axis=1)
-    corners = np.take_along_axis(corners, order[..., None], axis=1)
-    places = np.take_along_axis(places, order, axis=1)
-    side = (np.arange(len(points))[:, None] >= places[owner]).sum(axis=1) - 1  # -1, before the first, is the last
-    chords = corners[:, [1, 2, 3, 0]] - corners
-    outward = np.stack([chords[..., 1], -chords[..., 0]], axis=2) / np.sqrt(_squared(chords))[..., None]
-    from_corner, chord = points - corners[owner, side], chords[owner, side]
-    along = (from_corner * chord).sum(axis=1) / _squared(chord)
-    profile = 4 * along * (1 - along)
-    key, count = 4 * owner + side % 4, 4 * len(contours)
-    off = np.bincount(key, profile * (from_corner * outward[owner, side]).sum(axis=1), count)
-    height = off / (np.bincount(key, profile**2, count) + 0.5)
-    return corners, outward * height.reshape(-1, 4)[..., None]
+    return np.asarray(start + before * (_cross(polygon[sides] - start, along) / turn)[:, None])

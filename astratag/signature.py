@@ -20,13 +20,14 @@ from astratag.codes.acceptance import FALSE_ACCEPT_RATE
 from astratag.codes.soft import correlations
 from astratag.compiled import (
     BITS,
-    BRIGHTNESS,
     CUBE,
     FLAG_MATRIX,
     GRAY,
     INDICES,
+    INT,
     MATRIX,
     PLACES_OF_MANY,
+    VECTOR,
     compiled,
 )
 from astratag.dictionary import Dictionary
@@ -40,7 +41,8 @@ from astratag.geometry import (
     layer_points,
     square,
 )
-from astratag.sampling import Brightness, Places, between, bilinear, sample
+from astratag.normal import dot
+from astratag.sampling import AS_GRAY, Light, Places, between, fading, light_between, sample
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -122,7 +124,8 @@ class Codebook:
         self.dictionary = dictionary
         self.false_accept_rate = false_accept_rate
         self.tau_hamming = tau_hamming
-        self._codes = dictionary.oriented.reshape(-1, CELLS).astype(float)
+        self._bits = np.ascontiguousarray(dictionary.oriented.reshape(-1, CELLS))
+        self._codes = self._bits.astype(float)
         self.unit_codes = np.stack([unit(self._codes @ mixing.T + around) for mixing, around in _mixings()])
         """All readings (3, 4 N, 48) at each of ``BLUR_UNITS``, with zero mean and unit length."""
         self._by_cell = np.ascontiguousarray(self.unit_codes.transpose(0, 2, 1))
@@ -162,22 +165,24 @@ class Codebook:
         if len(cells) == 0:
             return []
         levels = np.zeros(len(cells), dtype=np.int64) if side_px is None else blur_level(side_px)
-        best, found = _best_codes(unit(cells), levels, self._by_cell)
-        return self._readings(best, found, cells, np.ones(cells.shape, dtype=bool))
+        best, found, wrong = _best_codes(cells, levels, self._by_cell, self._bits)
+        return self._readings(best, found, wrong, np.full(len(cells), CELLS))
 
     def read_seen(self, cells: Array, seen: NDArray[np.bool_]) -> list[Reading]:
         """Return the best reading of each row of cells (Q, 48) when only those that are ``seen`` (Q, 48) count."""
         found = correlations(cells, seen, self._codes)
         best = found.argmax(axis=1)
-        return self._readings(best, found[np.arange(len(best)), best], cells, seen)
+        wrong = hamming(cells, self._bits[best], seen)
+        return self._readings(best, found[np.arange(len(best)), best], wrong, seen.sum(axis=1))
 
-    def _readings(self, best: NDArray[np.int64], found: Array, cells: Array, seen: NDArray[np.bool_]) -> list[Reading]:
-        """Return the readings that are the ``best`` (Q,) of all codes, and correlate as ``found`` (Q,)."""
-        wrong = hamming(cells, self.dictionary.oriented.reshape(-1, CELLS)[best], seen)
-        rows = zip(best.tolist(), found.tolist(), wrong.tolist(), seen.sum(axis=1).tolist(), strict=True)
+    def _readings(
+        self, best: NDArray[np.int64], found: Array, wrong: NDArray[np.int64], count: NDArray[np.int64]
+    ) -> list[Reading]:
+        """Return the readings: the ``best`` (Q,) of all codes, how these correlate, and how many cells are wrong."""
+        rows = zip(best.tolist(), found.tolist(), wrong.tolist(), count.tolist(), strict=True)
         return [
-            Reading(self.dictionary.ids[code // 4], code % 4, correlation, differ, cells=count)
-            for code, correlation, differ, count in rows
+            Reading(self.dictionary.ids[code // 4], code % 4, correlation, differ, cells=cells)
+            for code, correlation, differ, cells in rows
         ]
 
     def read_as(self, cells: Array, marker_id: int, side_px: float | None = None) -> Reading:
@@ -185,19 +190,15 @@ class Codebook:
 
         One that looks ``side_px`` large, or as blurred as chance explains least.
         """
-        row = self.dictionary.row(marker_id)
-        found = (self._upright[row] @ unit(cells[None])[0]).tolist()
-        if side_px is None:
-            level = max(range(len(found)), key=lambda i: found[i] - self._least_of_levels[i])
-        else:
-            level = int(blur_level(side_px))
-        wrong = int(hamming(cells[None], self.dictionary.signatures[row : row + 1])[0])
-        return Reading(marker_id, 0, found[level], wrong, cells=BLURRED_CELLS[level])
+        row, level = self.dictionary.row(marker_id), -1 if side_px is None else int(blur_level(side_px))
+        printed = self.dictionary.signatures[row : row + 1]
+        correlation, level, wrong = _read_as(cells[None], self._upright[row], printed, self._least_of_levels, level)
+        return Reading(marker_id, 0, correlation, wrong, cells=BLURRED_CELLS[level])
 
     @cached_property
-    def _least_of_levels(self) -> list[float]:
-        """Return which correlation with codes at each of ``BLUR_UNITS`` chance rarely exceeds."""
-        return [self.least(1, worth) for worth in BLURRED_CELLS]
+    def _least_of_levels(self) -> Array:
+        """Return which correlation (3,) with codes at each of ``BLUR_UNITS`` chance rarely exceeds."""
+        return np.array([self.least(1, worth) for worth in BLURRED_CELLS])
 
     def read_seen_as(self, cells: Array, seen: NDArray[np.bool_], marker_id: int) -> Reading:
         """Return how well the ``seen`` (48,) of cells (48,) fit an upright marker of a known identity."""
@@ -248,24 +249,6 @@ def unit(cells: Array) -> Array:
     return rows
 
 
-@compiled(MATRIX, INDICES, CUBE)
-def _best_codes(cells: Array, level: NDArray[np.int64], codes: Array) -> tuple[NDArray[np.int64], Array]:
-    """Return which code (Q,) each row of unit cells (Q, 48) correlates with best, and how well (Q,).
-
-    ``codes`` (L, 48, K) are of unit length, at the ``level`` (Q,) of blur of each row.
-    """
-    best, correlation = np.empty(len(cells), dtype=np.int64), np.empty(len(cells))
-    for q in range(len(cells)):
-        found = np.zeros(codes.shape[2])
-        for c in range(CELLS):
-            cell, white = cells[q, c], codes[level[q], c]
-            for k in range(len(found)):
-                found[k] += cell * white[k]
-        best[q] = found.argmax()
-        correlation[q] = found[best[q]]
-    return best, correlation
-
-
 def hamming(cells: Array, codes: NDArray[np.uint8], seen: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
     """Return how many of the ``seen`` cells of each row (Q, 48) are on the wrong side of half way from black to white.
 
@@ -289,13 +272,55 @@ def _wrong(cells: Array, codes: NDArray[np.uint8], seen: NDArray[np.bool_]) -> N
     return wrong
 
 
-def cell_values(gray: Brightness, samples_px: Places) -> Array:
-    """Return the 48 cell means (Q, 48), black level removed, of patterns sampled at ``SAMPLES`` (Q, S, 2)."""
-    return _cells(gray, np.ascontiguousarray(samples_px), _ILLUMINATION)
+@compiled(MATRIX, INDICES, CUBE, BITS)
+def _best_codes(
+    cells: Array, level: NDArray[np.int64], codes: Array, bits: NDArray[np.uint8]
+) -> tuple[NDArray[np.int64], Array, NDArray[np.int64]]:
+    """Return which code (Q,) each row of cells (Q, 48) correlates with best, how well (Q,), and its wrong cells (Q,).
+
+    ``codes`` (L, 48, K) are of unit length, at the ``level`` (Q,) of blur of each row; ``bits`` (K, 48) as printed.
+    """
+    rows, best, correlation = unit(cells), np.empty(len(cells), dtype=np.int64), np.empty(len(cells))
+    printed = np.empty(cells.shape, dtype=np.uint8)
+    for q in range(len(cells)):
+        found = np.zeros(codes.shape[2])
+        for c in range(CELLS):
+            cell, white = rows[q, c], codes[level[q], c]
+            for k in range(len(found)):
+                found[k] += cell * white[k]
+        best[q] = found.argmax()
+        correlation[q] = found[best[q]]
+        printed[q] = bits[best[q]]
+    return best, correlation, _wrong(cells, printed, np.ones(cells.shape, dtype=np.bool_))
 
 
-@compiled(BRIGHTNESS, PLACES_OF_MANY, MATRIX)
-def _cells(gray: NDArray, samples_px: NDArray, illumination: Array) -> Array:
+@compiled(MATRIX, MATRIX, BITS, VECTOR, INT)
+def _read_as(
+    cells: Array, codes: Array, printed: NDArray[np.uint8], least: Array, level: int
+) -> tuple[float, int, int]:
+    """Return how well cells (1, 48) correlate with a code, at which level of blur, and how many of them are wrong.
+
+    ``codes`` (L, 48) are of unit length and ``printed`` (1, 48) as it is; a negative ``level`` is the one at which the
+    correlation most exceeds the ``least`` (L,).
+    """
+    row, found = unit(cells)[0], np.empty(len(codes))
+    for k in range(len(codes)):
+        found[k] = dot(codes[k], row)
+    if level < 0:
+        level = int((found - least).argmax())
+    return found[level], level, _wrong(cells, printed, np.ones(cells.shape, dtype=np.bool_))[0]
+
+
+def cell_values(gray: Image, samples_px: Places, of_gray: Array = AS_GRAY) -> Array:
+    """Return the 48 cell means (Q, 48), black level removed, of patterns sampled at ``SAMPLES`` (Q, S, 2).
+
+    Of what ``of_gray`` (256,) makes of each gray value.
+    """
+    return _cells(gray, of_gray, np.ascontiguousarray(samples_px), _ILLUMINATION)
+
+
+@compiled(GRAY, VECTOR, PLACES_OF_MANY, MATRIX)
+def _cells(gray: Image, of_gray: Array, samples_px: NDArray, illumination: Array) -> Array:
     """Return cells (Q, 48) of patterns sampled at cells, and where they are black, (Q, S, 2).
 
     Each black sample adds a row of ``illumination`` (B, 48) to the black level at the cells.
@@ -304,7 +329,8 @@ def _cells(gray: NDArray, samples_px: NDArray, illumination: Array) -> Array:
     values = np.empty(samples_px.shape[1])
     for q in range(len(cells)):
         for s in range(len(values)):
-            values[s] = bilinear(gray, samples_px[q, s, 0], samples_px[q, s, 1])
+            x, y = samples_px[q, s, 0], samples_px[q, s, 1]
+            values[s] = light_between(gray, of_gray, x, y) * fading(x, y, gray.shape[0], gray.shape[1])
         for c in range(CELLS):
             cells[q, c] = values[c * SAMPLES_A_CELL : (c + 1) * SAMPLES_A_CELL].mean()
         for b in range(len(illumination)):
@@ -313,9 +339,9 @@ def _cells(gray: NDArray, samples_px: NDArray, illumination: Array) -> Array:
     return cells
 
 
-def layer_cells(gray: Brightness, warp: Warp, layer: int) -> Array:
+def layer_cells(light: Light, warp: Warp, layer: int) -> Array:
     """Return the cells (48,) of one layer of a marker whose print is warped into the image."""
-    return cell_values(gray, warp(_LAYER_SAMPLES[layer])[None])[0]
+    return cell_values(light.gray, warp(_LAYER_SAMPLES[layer])[None], light.of_gray)[0]
 
 
 class Artwork:

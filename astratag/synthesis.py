@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -32,7 +32,7 @@ from astratag.geometry import (
     square,
 )
 from astratag.looks import AROUND, BY_BLUR, BY_X, BY_Y, MEAN, OUTSIDE, looks
-from astratag.normal import left_over
+from astratag.normal import left_over, ranked
 from astratag.steps import contrast, step, values
 from astratag.warp import FittedWarp
 
@@ -51,6 +51,8 @@ OF_COMMON = 3 + FIRST_CELL
 KEPT_PICTURES = 64
 NODES, MANY_NODES = 24, 64
 """Points that stand for the Gaussian a pixel sees through: of a picture blurred beforehand, and of a sharp one."""
+WIDE = 1.8
+"""Where, at a slant, what is left of the blur is so many times the picture's softness one way, two rings are coarse."""
 SOFTNESS = tuple(4.0 * 2 ** (k / 2) for k in range(10))
 """Blurs of pictures that are kept, template units, and"""
 SOFT_SHARE = 0.85
@@ -113,10 +115,35 @@ def _nodes(count: int) -> Array:
     return np.ascontiguousarray(np.linalg.solve(np.linalg.cholesky(nodes.T @ nodes / count), nodes.T).T)
 
 
-_NODES, _MANY_NODES = _nodes(NODES), _nodes(MANY_NODES)
-_X, _Y = _NODES.T
-_MOMENTS = (np.stack([_X**0, _X, _Y, _X * _X - 1, _X * _Y, _Y * _Y - 1]) / NODES).astype(np.float32)
-"""Take brightnesses at the nodes to their mean, and by parts to its first and second derivatives (6, K)."""
+_MANY_NODES = _nodes(MANY_NODES)
+
+
+class Nodes(NamedTuple):
+    """Points (K, 2) that stand for a standard normal distribution in the plane, and ``moments`` (6, K) over them.
+
+    The moments take brightnesses there to their mean, and by parts to its first and second derivatives.
+    """
+
+    places: Light
+    moments: Light
+
+
+def _weighted(places: Array, weights: Array) -> Nodes:
+    """Return nodes of given weights (K,), which add up to one."""
+    x, y = places.T
+    moments = np.stack([x**0, x, y, x * x - 1, x * y, y * y - 1]) * weights
+    return Nodes(places.astype(np.float32), moments.astype(np.float32))
+
+
+def _rings() -> Nodes:
+    """Return hexagons at the two radii of Gauss-Laguerre quadrature, turned against each other."""
+    squares, weights = np.polynomial.laguerre.laggauss(2)
+    angle = (np.arange(6) + [[0.0], [0.5]]) * np.pi / 3
+    places = np.sqrt(2 * squares)[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=2)
+    return _weighted(places.reshape(-1, 2), np.repeat(weights / 6, 6))
+
+
+_FEW, _SPREAD = _rings(), _weighted(_nodes(NODES), np.full(NODES, 1 / NODES))
 
 
 @cache
@@ -143,15 +170,13 @@ class Look:
     weight: Array
 
     @cached_property
-    def finest(self) -> float:
-        """Return the template units of a pixel the way it has fewest: a tenth of the points have still fewer."""
-        ordered = np.sort(_fewest(self.to_template))
-        below, part = divmod(0.1 * (len(ordered) - 1), 1)
-        return float(ordered[int(below)] * (1 - part) + ordered[int(below) + 1] * part)
+    def units(self) -> tuple[float, float]:
+        """Return the template units of a pixel the ways it has fewest and most: a tenth of points have fewer, more."""
+        return _units(self.to_template)
 
     def softness(self, blur_px: float) -> float:
         """Return the softest of ``SOFTNESS`` that a picture may have to be seen through a blur, 0 for a sharp one."""
-        limit = SOFT_SHARE * blur_px * self.finest
+        limit = SOFT_SHARE * blur_px * self.units[0]
         return max((softness for softness in SOFTNESS if softness <= limit), default=0.0)
 
 
@@ -188,14 +213,16 @@ def _seen(stencil_px: Array, visible: Seen, height: int, width: int, spacing: fl
 
 
 @compiled(CUBE)
-def _fewest(to_template: Array) -> Array:
-    """Return the smaller singular values (N,) of matrices (N, 2, 2)."""
-    fewest = np.empty(len(to_template))
-    for n in range(len(fewest)):
+def _units(to_template: Array) -> tuple[float, float]:
+    """Return the smaller singular value of matrices (N, 2, 2) that a tenth have less than, and the larger, more."""
+    count = len(to_template)
+    fewest, most = np.empty(count), np.empty(count)
+    for n in range(count):
         a, b, c, d = to_template[n, 0, 0], to_template[n, 0, 1], to_template[n, 1, 0], to_template[n, 1, 1]
         total, area = a * a + b * b + c * c + d * d, a * d - b * c
-        fewest[n] = math.sqrt(max(total - math.sqrt(max(total * total - 4 * area * area, 0.0)), 0.0) / 2)
-    return fewest
+        apart = math.sqrt(max(total * total - 4 * area * area, 0.0))
+        fewest[n], most[n] = math.sqrt(max(total - apart, 0.0) / 2), math.sqrt((total + apart) / 2)
+    return ranked(fewest, count // 10), ranked(most, count - 1 - count // 10)
 
 
 def look(warp: FittedWarp, shape: tuple[int, ...], reach: float = REACH) -> Look | None:
@@ -209,11 +236,11 @@ def look(warp: FittedWarp, shape: tuple[int, ...], reach: float = REACH) -> Look
     return Look(points if len(seen[0]) == len(points) else points[use], *seen)
 
 
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """A print's brightness and what is beyond it (H, W, 2), blurred by ``softness``, a texel every ``texel`` units."""
+class Picture(NamedTuple):
+    """A print's brightness and what is beyond it (H, W), blurred by ``softness``, a texel every ``texel`` units."""
 
-    channels: Light
+    brightness: Light
+    beyond: Light
     softness: float
     texel: float
 
@@ -240,8 +267,9 @@ def expected(seen: Look, picture: Picture, blur_px: float) -> Expected:
 
 def looks_of(seen: Look, picture: Picture, blur_px: float) -> Array:
     """Return the same as rows (5, N), in the order of ``steps``."""
-    of_picture = picture.channels, picture.softness, picture.texel
-    return looks(seen.template, seen.to_template, *of_picture, blur_px, _NODES, _MOMENTS)
+    rest = (blur_px * seen.units[1]) ** 2 - picture.softness**2
+    nodes = _FEW if rest < (WIDE * picture.softness) ** 2 else _SPREAD
+    return looks(seen.template, seen.to_template, *picture, blur_px, *nodes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -410,4 +438,4 @@ def _picture(signature: bytes, softness: float) -> Picture:
         channels.append(
             cv2.GaussianBlur(small, (0, 0), deviation, borderType=cv2.BORDER_REPLICATE) if softness else small
         )
-    return Picture(cv2.merge(channels), softness, texel)
+    return Picture(channels[0], channels[1], softness, texel)

@@ -113,7 +113,7 @@ class Tracker:
             if seen is not None:
                 found.append(seen)
                 before[id(seen)] = track.T_cam_marker
-        return surest(found), before
+        return surest(found) if len(found) > 1 else found, before
 
     def _around(self, track: Track, camera: Camera) -> Array:
         """Return where the corners (8, 2) of a tracked marker may be: where they were, and moved on."""
@@ -123,8 +123,8 @@ class Tracker:
 
     def _follow(self, view: View, track: Track) -> Detection | None:
         """Return a tracked marker where it is predicted; None when it is not there."""
-        low, high = track.corners_px.min(axis=0), track.corners_px.max(axis=0)
-        inside = low.min() > STEADY_PX and (high < np.array(view.gray.shape[::-1]) - STEADY_PX).all()
+        right, bottom = view.gray.shape[1] - STEADY_PX, view.gray.shape[0] - STEADY_PX
+        inside = all(STEADY_PX < x < right and STEADY_PX < y < bottom for x, y in track.corners_px.tolist())
         edges = OUTER_EDGES if inside else ALL_EDGES
         steady = [(track.predictions[0], STEADY_PX, edges)] if len(track.predictions) > 1 else []
         for T_cam_marker, search_px, edges in [*steady, *((T, TRACK_PX, ALL_EDGES) for T in track.predictions)]:
@@ -186,7 +186,9 @@ class Tracker:
 
 def _box(around: Array, margin: float, margin_px: float, camera: Camera) -> NDArray[np.int64] | None:
     """Return the part of the image (2, 2) about points (N, 2), low and high x, y; None when hardly any is in it."""
-    low, high = around.min(axis=0), around.max(axis=0)
-    wider = margin * (high - low) + margin_px
-    box = np.clip(np.stack([low - wider, high + wider]), 0, (camera.width, camera.height)).astype(int)
-    return box if (box[1] - box[0]).min() >= LEAST_BOX_PX else None
+    box = []
+    for places, size in zip(around.T.tolist(), (camera.width, camera.height), strict=True):
+        low, high = min(places), max(places)
+        wider = margin * (high - low) + margin_px
+        box.append((int(max(0.0, min(size, low - wider))), int(max(0.0, min(size, high + wider)))))
+    return np.array(box).T if min(high - low for low, high in box) >= LEAST_BOX_PX else None

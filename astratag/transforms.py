@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 
 SMALL_ANGLE_RAD = 1e-4
 """Below it the series are exact to the last digit."""
+LEAST_SINE = 1e-12
+"""Of half an angle: what is smaller is the half-angle itself."""
 
 
 def pose(R_a_b: ArrayLike, t_a_b_m: ArrayLike) -> Array:
@@ -48,10 +50,7 @@ def exp_so3(theta_rad: ArrayLike) -> Array:
 
 def log_so3(R_a_b: Array) -> Array:
     """Return the rotation vector (3,) of a rotation, its angle in [0, pi]."""
-    w, *v = wxyz_from_rotation(R_a_b).tolist()
-    length = math.hypot(*v)
-    scale = 2.0 * math.atan2(length, w) / length if length > 1e-12 else 2.0  # w is 1 there
-    return np.array([scale * v[0], scale * v[1], scale * v[2]])
+    return _log_so3(np.ascontiguousarray(R_a_b, dtype=float))
 
 
 def skew(v: ArrayLike) -> Array:
@@ -67,27 +66,12 @@ def perturb(T_a_b: Array, xi: ArrayLike) -> Array:
 
 def difference(T_a_b: Array, T_a_b_hat: Array) -> Array:
     """Return xi (6,) with perturb(T_a_b_hat, xi) == T_a_b: the error whose covariance a pose carries."""
-    R_hat = T_a_b_hat[:3, :3]
-    rho = R_hat.T @ (T_a_b[:3, 3] - T_a_b_hat[:3, 3])
-    return np.concatenate([rho, log_so3(R_hat.T @ T_a_b[:3, :3])])
+    return _difference(np.ascontiguousarray(T_a_b, dtype=float), np.ascontiguousarray(T_a_b_hat, dtype=float))
 
 
-def wxyz_from_rotation(R_a_b: Array) -> Array:
-    """Return the unit quaternion (w, x, y, z), w >= 0.
-
-    By the largest of its components, so that none is divided by a small one (Shepperd, 1978).
-    """
-    (a, b, c), (d, e, f), (g, h, i) = np.asarray(R_a_b, dtype=float).tolist()
-    columns = (
-        (1 + a + e + i, h - f, c - g, d - b),
-        (h - f, 1 + a - e - i, b + d, c + g),
-        (c - g, b + d, 1 - a + e - i, f + h),
-        (d - b, c + g, f + h, 1 - a - e + i),
-    )
-    largest = max(range(4), key=lambda k: columns[k][k])
-    q = columns[largest]
-    scale = math.copysign(1 / math.hypot(*q), q[0])
-    return np.array(q) * scale
+def wxyz_from_rotation(R_a_b: ArrayLike) -> Array:
+    """Return the unit quaternion (w, x, y, z), w >= 0."""
+    return _wxyz(np.ascontiguousarray(R_a_b, dtype=float))
 
 
 def rotation_from_wxyz(rotation_wxyz: ArrayLike) -> Array:
@@ -116,3 +100,48 @@ def perturbed(T_a_b: Array, xi: Array) -> Array:
         moved[i, 2] = same * c + along * z + sine * (a * y - b * x)
         moved[i, 3] = T_a_b[i, 3] + a * xi[0] + b * xi[1] + c * xi[2]
     return moved
+
+
+@compiled(MATRIX)
+def _wxyz(R: Array) -> Array:
+    """Return ``wxyz_from_rotation``.
+
+    By the largest of its components, so that none is divided by a small one (Shepperd, 1978).
+    """
+    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    xy, xz, yz = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
+    a, e, i = R[0, 0], R[1, 1], R[2, 2]
+    columns = (
+        (1 + a + e + i, x, y, z),
+        (x, 1 + a - e - i, xy, xz),
+        (y, xy, 1 - a + e - i, yz),
+        (z, xz, yz, 1 - a - e + i),
+    )
+    largest, q = columns[0][0], columns[0]
+    for column, own in ((columns[1], columns[1][1]), (columns[2], columns[2][2]), (columns[3], columns[3][3])):
+        if own > largest:
+            largest, q = own, column
+    scale = math.copysign(1 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]), q[0])
+    return np.array([scale * q[0], scale * q[1], scale * q[2], scale * q[3]])
+
+
+@compiled(MATRIX)
+def _log_so3(R: Array) -> Array:
+    """Return ``log_so3``."""
+    w, x, y, z = _wxyz(R)
+    length = math.sqrt(x * x + y * y + z * z)
+    scale = 2.0 * math.atan2(length, w) / length if length > LEAST_SINE else 2.0  # w is 1 there
+    return np.array([scale * x, scale * y, scale * z])
+
+
+@compiled(MATRIX, MATRIX)
+def _difference(T: Array, T_hat: Array) -> Array:
+    """Return ``difference``."""
+    turned, xi = np.zeros((3, 3)), np.zeros(6)
+    for i in range(3):
+        for k in range(3):
+            xi[i] += T_hat[k, i] * (T[k, 3] - T_hat[k, 3])
+            for j in range(3):
+                turned[i, j] += T_hat[k, i] * T[k, j]
+    xi[3:] = _log_so3(turned)
+    return xi

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -12,11 +14,12 @@ from astratag.camera import Camera
 from astratag.checks import picture
 from astratag.cylinder import assumed_camera
 from astratag.effort import Effort, Tries
+from astratag.sampling import Light
 from astratag.search import Binarisation, Outlines, Scaled
 
 Array = NDArray[np.float64]
 
-MAX_BY_EDGES, MAX_ALIGNED, MAX_CURVED = 12, 5, 6
+MAX_BY_EDGES, MAX_ALIGNED, MAX_CURVED = 8, 4, 6
 """Candidates in one image whose edges are fitted; that are moved until they look as they read; and so on cylinders."""
 
 
@@ -30,14 +33,28 @@ class View:
     """
 
     gray: NDArray[np.uint8]
-    light: NDArray[np.float32]
+    light: Light
     camera: Camera | None
     effort: Effort
+    buffer: NDArray[np.float32]
+    """Where the light of all its pixels (H, W) is put when it is asked for."""
+    boxes: Sequence[NDArray[np.int64]] | None = None
+    """The parts that are looked at, (2, 2) pixels: low and high x, y; None is all."""
     by_edges: Tries = field(default_factory=lambda: Tries(MAX_BY_EDGES))
     aligned: Tries = field(default_factory=lambda: Tries(MAX_ALIGNED))
     curved: Tries = field(default_factory=lambda: Tries(MAX_CURVED))
     scaled: dict[float, Scaled] = field(default_factory=dict)
     outlines: dict[Binarisation, Outlines] = field(default_factory=dict)
+
+    @cached_property
+    def lit(self) -> NDArray[np.float32]:
+        """Return the light (H, W) of all its pixels in the boxes, 0..255: for what looks at all, not at a few."""
+        gray, of_gray = self.light.gray, self.light.of_gray.astype(np.float32)
+        whole = np.array([(0, 0), gray.shape[::-1]])
+        for (left, top), (right, bottom) in [whole] if self.boxes is None else self.boxes:
+            part = slice(int(top), int(bottom)), slice(int(left), int(right))
+            cv2.LUT(gray[part], of_gray, dst=self.buffer[part])
+        return self.buffer
 
     @property
     def some_camera(self) -> Camera:

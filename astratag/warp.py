@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astratag.camera import Camera, pixel, pixel_slope
-from astratag.compiled import CUBE, MATRIX, REAL, VECTOR, compiled
+from astratag.compiled import CUBE, INT, MATRIX, REAL, VECTOR, compiled
 from astratag.geometry import TEMPLATE_UNITS, print_from_template
 from astratag.surface import Flat, Surface
 from astratag.transforms import perturb
@@ -25,6 +25,9 @@ Array = NDArray[np.float64]
 
 OUTSIDE_PX = -1e4
 """Where points behind the camera are said to be: far outside every image."""
+FREE = np.full(8, np.inf)
+FREE.flags.writeable = False
+"""Of parameters that one step may take anywhere, not to be changed."""
 BEND_STEP_PX = 3.0
 LEAST_AREA = 1e-9
 LEAST_DEPTH = 1e-6
@@ -106,7 +109,7 @@ class HomographyWarp:
 
     def step_sigma(self) -> Array:
         """Return no limits (8,)."""
-        return np.full(8, np.inf)
+        return FREE[:8]
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +149,7 @@ class BentWarp:
 
     def step_sigma(self) -> Array:
         """Return limits (14,) on the bend only: outer edges alone do not tell how it stretches the inside."""
-        return np.concatenate([np.full(8, np.inf), np.full(6, BEND_STEP_PX)])
+        return np.concatenate([FREE[:8], np.full(6, BEND_STEP_PX)])
 
     @classmethod
     def from_points(cls, template: Array, points_px: Array) -> BentWarp:
@@ -169,11 +172,12 @@ def on_surface(surface: Surface, side_m: float, template: Array) -> tuple[Array,
     if template.flags.writeable:
         return _on_surface(surface, side_m, np.asarray(template, dtype=float).tobytes())
     key = (surface, side_m, id(template))
-    if key not in _KEPT:
+    kept = _KEPT.get(key)
+    if kept is None:
         if len(_KEPT) >= MOST_KEPT:
             _KEPT.clear()
-        _KEPT[key] = (template, *_on_surface(surface, side_m, np.asarray(template, dtype=float).tobytes()))
-    return _KEPT[key][1:]
+        kept = _KEPT[key] = (template, *_on_surface(surface, side_m, np.asarray(template, dtype=float).tobytes()))
+    return kept[1:]
 
 
 _KEPT: dict[tuple[Surface, float, int], tuple[Array, Array, Array]] = {}
@@ -231,7 +235,7 @@ class PoseWarp:
 
     def step_sigma(self) -> Array:
         """Return no limits (6,)."""
-        return np.full(6, np.inf)
+        return FREE[:6]
 
     @property
     def curved(self) -> bool:
@@ -248,6 +252,16 @@ def sides_of(corners: Array) -> tuple[float, float]:
         length = np.sqrt(dx * dx + dy * dy)
         total, longest = total + length, max(longest, length)
     return total / 4, longest
+
+
+@compiled(CUBE, INT, INT)
+def quads_inside(quads: Array, height: int, width: int) -> NDArray[np.bool_]:
+    """Return which quads (Q, 4, 2) have all their corners inside an image."""
+    inside = np.ones(len(quads), np.bool_)
+    for q in range(len(quads)):
+        for x, y in quads[q]:
+            inside[q] &= 0 <= x <= width - 1 and 0 <= y <= height - 1
+    return inside
 
 
 @compiled(MATRIX)
@@ -338,69 +352,73 @@ def slopes_of(J: Array, along: Array) -> Array:
     return slopes
 
 
-@compiled(MATRIX, MATRIX)
-def _in_camera(points_marker: Array, T: Array) -> Array:
-    """Return points (3, N) of the marker frame in the camera's."""
-    points_cam = np.empty(points_marker.shape)
-    for axis in range(3):
-        for i in range(points_marker.shape[1]):
-            x, y, z = points_marker[0, i], points_marker[1, i], points_marker[2, i]
-            points_cam[axis, i] = T[axis, 0] * x + T[axis, 1] * y + T[axis, 2] * z + T[axis, 3]
-    return points_cam
+@compiled(MATRIX, REAL, REAL, REAL)
+def in_camera(T: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Return a point of the marker frame in the camera's."""
+    right = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+    down = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+    return right, down, T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
 
 
 @compiled(MATRIX, MATRIX, VECTOR, REAL)
 def seen_from(points_marker: Array, T_cam_marker: Array, lens: Array, nearest_m: float) -> Array:
     """Return the pixels (N, 2) of points (3, N), those not before the camera outside every image."""
-    x, y, z = _in_camera(points_marker, T_cam_marker)
-    at = np.empty((len(x), 2))
-    for i in range(len(x)):
-        if z[i] > nearest_m:
-            at[i, 0], at[i, 1] = pixel(x[i], y[i], z[i], lens)
-        else:
-            at[i] = OUTSIDE_PX
+    at = np.empty((points_marker.shape[1], 2))
+    for i in range(len(at)):
+        x, y, z = in_camera(T_cam_marker, points_marker[0, i], points_marker[1, i], points_marker[2, i])
+        before = z > nearest_m
+        u, v = pixel(x, y, z if before else 1.0, lens)
+        at[i, 0], at[i, 1] = u if before else OUTSIDE_PX, v if before else OUTSIDE_PX
     return at
+
+
+@compiled(MATRIX, VECTOR, REAL, REAL, REAL, REAL, REAL)
+def _pose_slope(
+    T: Array, lens: Array, x: float, y: float, z: float, right: float, down: float
+) -> tuple[float, float, float, float, float, float]:
+    """Return how a point's pixel moves along the image vector (right, down) as the pose is perturbed."""
+    x_cam, y_cam, z_cam = in_camera(T, x, y, z)
+    a, b, c = pixel_slope(x_cam, y_cam, z_cam, lens, right, down)
+    gx = T[0, 0] * a + T[1, 0] * b + T[2, 0] * c
+    gy = T[0, 1] * a + T[1, 1] * b + T[2, 1] * c
+    gz = T[0, 2] * a + T[1, 2] * b + T[2, 2] * c
+    return gx, gy, gz, y * gz - z * gy, z * gx - x * gz, x * gy - y * gx  # g . (theta x X)
 
 
 @compiled(MATRIX, MATRIX, VECTOR, MATRIX)
 def _pose_slopes(points_marker: Array, T_cam_marker: Array, lens: Array, along: Array) -> Array:
     """Return how the pixels of points (3, N) move along image vectors (2, N) as the pose is perturbed: (6, N)."""
-    R, points_cam = T_cam_marker, _in_camera(points_marker, T_cam_marker)
     slopes = np.empty((6, points_marker.shape[1]))
     for i in range(points_marker.shape[1]):
-        a, b, c = pixel_slope(points_cam[0, i], points_cam[1, i], points_cam[2, i], lens, along[0, i], along[1, i])
         x, y, z = points_marker[0, i], points_marker[1, i], points_marker[2, i]
-        gx = R[0, 0] * a + R[1, 0] * b + R[2, 0] * c
-        gy = R[0, 1] * a + R[1, 1] * b + R[2, 1] * c
-        gz = R[0, 2] * a + R[1, 2] * b + R[2, 2] * c
-        slopes[0, i], slopes[1, i], slopes[2, i] = gx, gy, gz
-        slopes[3, i], slopes[4, i], slopes[5, i] = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx  # g . (theta x X)
+        by = _pose_slope(T_cam_marker, lens, x, y, z, along[0, i], along[1, i])
+        slopes[0, i], slopes[1, i], slopes[2, i], slopes[3, i], slopes[4, i], slopes[5, i] = by
     return slopes
 
 
 @compiled(MATRIX, MATRIX, VECTOR)
 def pose_jacobian(points_marker: Array, T_cam_marker: Array, lens: Array) -> Array:
     """Return the derivative (N, 2, 6) of the pixels of points (3, N) by a right perturbation of the pose."""
-    J, along = np.empty((points_marker.shape[1], 2, 6)), np.empty((2, points_marker.shape[1]))
-    for axis in range(2):
-        along[axis], along[1 - axis] = 1.0, 0.0
-        slopes = _pose_slopes(points_marker, T_cam_marker, lens, along)
-        for p in range(6):
-            for i in range(points_marker.shape[1]):
-                J[i, axis, p] = slopes[p, i]
+    J = np.empty((points_marker.shape[1], 2, 6))
+    for i in range(len(J)):
+        x, y, z = points_marker[0, i], points_marker[1, i], points_marker[2, i]
+        by = _pose_slope(T_cam_marker, lens, x, y, z, 1.0, 0.0)
+        J[i, 0, 0], J[i, 0, 1], J[i, 0, 2], J[i, 0, 3], J[i, 0, 4], J[i, 0, 5] = by
+        by = _pose_slope(T_cam_marker, lens, x, y, z, 0.0, 1.0)
+        J[i, 1, 0], J[i, 1, 1], J[i, 1, 2], J[i, 1, 3], J[i, 1, 4], J[i, 1, 5] = by
     return J
 
 
 @compiled(MATRIX, MATRIX, MATRIX)
 def _facing(points_marker: Array, normals_marker: Array, T_cam_marker: Array) -> NDArray[np.bool_]:
     """Return which points (3, N) with outward normals (3, N) face the camera by more than a grazing angle."""
-    R, (x, y, z) = T_cam_marker, _in_camera(points_marker, T_cam_marker)
-    facing = np.empty(len(x), np.bool_)
-    for i in range(len(x)):
+    R, facing = T_cam_marker, np.empty(points_marker.shape[1], np.bool_)
+    for i in range(len(facing)):
+        x, y, z = in_camera(T_cam_marker, points_marker[0, i], points_marker[1, i], points_marker[2, i])
         p, q, r = normals_marker[0, i], normals_marker[1, i], normals_marker[2, i]
         towards = 0.0
-        for axis, across in enumerate((x[i], y[i], z[i])):
+        for axis, across in enumerate((x, y, z)):
             towards -= across * (R[axis, 0] * p + R[axis, 1] * q + R[axis, 2] * r)
-        length = np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
-        facing[i] = towards > GRAZING_COSINE * length and z[i] > 0
+        length = np.sqrt(x * x + y * y + z * z)
+        facing[i] = towards > GRAZING_COSINE * length and z > 0
     return facing

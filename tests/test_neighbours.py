@@ -14,6 +14,7 @@ from astratag.neighbours import crossings, narrowing, pull
 CODE = load_dictionary().signature(7).tobytes()
 BLACK = bytes(CELLS)
 OUTERMOST = np.arange(4)
+EVERY_POINT = np.ones(EDGE_POINTS.shape[:2], dtype=bool)
 MIDDLE_FRAME_UNITS = 180.0 - 1.0
 
 
@@ -28,7 +29,7 @@ def steepest(distances: np.ndarray, jumps: np.ndarray, blur_px: float) -> float:
 def test_the_pull_is_where_a_blurred_profile_is_steepest(unit_px: float) -> None:
     """Where all crossings are square to the line, the profile is known in closed form."""
     near, blur_px = crossings(CODE), 1.15
-    found = pull(near, OUTERMOST, np.full((4, EDGE_POINTS.shape[1]), unit_px), blur_px)
+    found = pull(*near, OUTERMOST, np.full((4, EDGE_POINTS.shape[1]), unit_px), blur_px, EVERY_POINT[OUTERMOST])
     compared = 0
     for edge in OUTERMOST.tolist():
         for point in range(EDGE_POINTS.shape[1]):
@@ -45,10 +46,10 @@ def test_the_pull_is_where_a_blurred_profile_is_steepest(unit_px: float) -> None
 def test_nothing_pulls_from_far_away() -> None:
     every = np.arange(len(EDGES))
     unit_px = np.full((len(EDGES), EDGE_POINTS.shape[1]), 10.0)
-    found = pull(crossings(CODE), every, unit_px, 1.2)
+    found = pull(*crossings(CODE), every, unit_px, 1.2, EVERY_POINT)
     np.testing.assert_allclose(found.px, 0, atol=1e-9)
     np.testing.assert_allclose(found.curvature, 1, atol=1e-9)
-    np.testing.assert_allclose(narrowing(crossings(CODE), every, unit_px, 1.2), 1, atol=1e-6)
+    np.testing.assert_allclose(narrowing(*crossings(CODE), every, unit_px, 1.2, EVERY_POINT), 1, atol=1e-6)
 
 
 def test_a_print_without_white_cells_pulls_no_outermost_edge() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -9,6 +10,7 @@ from scipy.stats import chi2
 from astratag.camera import Camera
 from astratag.detection import LayerDetection
 from astratag.geometry import LAYERS, square
+from astratag.ippe import plane_poses
 from astratag.pose import mirrored, planar_poses, poses_from_square, refine_on_corners
 from astratag.surface import Cylinder, Flat, Surface
 from astratag.transforms import difference, exp_so3, pose
@@ -47,6 +49,20 @@ def test_a_far_flat_marker_has_two_poses_and_one_is_true() -> None:
     off = [np.linalg.norm(difference(T, planar.T_cam_marker)[3:]) for planar in poses]
     assert min(off) < 1e-3 < 0.3 < max(off)
     assert poses[0].reprojection_rms_px <= poses[1].reprojection_rms_px < 1.0
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_two_poses_of_a_plane_are_those_of_opencv(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points_m = 0.1 * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]) + rng.normal(0, 0.02, (4, 2))
+    seen = points_m @ exp_so3(rng.normal(0, 0.8, 3))[:, :2].T + (*rng.normal(0, 0.2, 2), rng.uniform(0.5, 3))
+    rays = np.ascontiguousarray(seen[:, :2] / seen[:, 2:]) + rng.normal(0, 1e-3, (4, 2))
+    flat = np.append(points_m, np.zeros((4, 1)), axis=1)
+    _, rotations, translations, _ = cv2.solvePnPGeneric(
+        flat, rays.reshape(-1, 1, 2), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+    )
+    theirs = [pose(exp_so3(r), t) for r, t in zip(rotations, translations, strict=True)]
+    np.testing.assert_allclose(plane_poses(points_m, rays), theirs, atol=1e-7)
 
 
 def test_corners_on_one_line_give_no_pose() -> None:

@@ -13,14 +13,14 @@ import pytest
 import astratag.confirm
 import astratag.detector
 from astratag import Camera, Detector, Flat, load_dictionary
-from astratag.binarise import threshold_blocks
+from astratag.binarise import sums_of, threshold_blocks, traced
 from astratag.candidates import Candidate
 from astratag.codes import Reading
 from astratag.describe import outer_corners
 from astratag.detector import MAX_MATCHED
-from astratag.effort import Effort, Tries, first_distinct
+from astratag.effort import BETTER, LEAST_UNITS, MOST_UNITS, UNITS_A_PIXEL, Effort, Tries, first_distinct
 from astratag.geometry import LAYERS, TEMPLATE_UNITS, square
-from astratag.polygons import simplified
+from astratag.polygons import hull, simplified
 from astratag.search import (
     BLOCK_PX,
     BROAD,
@@ -129,8 +129,25 @@ def test_blocks_are_told_apart_as_by_opencv(how, holes):
     kind, offset = (cv2.THRESH_BINARY, -how.offset) if holes else (cv2.THRESH_BINARY_INV, how.offset)
     whole = cv2.adaptiveThreshold(gray, 255, cv2.ADAPTIVE_THRESH_MEAN_C, kind, how.window_px, offset)
     inside = np.kron(worth, np.ones((32, 32), dtype=bool))[: len(gray), : gray.shape[1]]
-    shapes = threshold_blocks(gray, worth, 32, how.window_px, how.offset, holes)
-    np.testing.assert_array_equal(shapes, np.where(inside, whole, 0))
+    shapes, changes = threshold_blocks(gray, sums_of(gray), worth, 32, how.window_px, how.offset, holes)
+    expected = np.where(inside, whole // 255, 0)
+    np.testing.assert_array_equal(shapes[1:251, 1:334], expected)
+    assert shapes.sum() == expected.sum()
+    assert changes == np.abs(np.diff(expected.astype(int), axis=1)).sum()
+
+
+@pytest.mark.parametrize("kind", ["noise", "blobs", "board", "JPEG", "squares"])
+def test_borders_are_followed_as_by_opencv(kind):
+    gray, everywhere = adversarial(kind), np.ones((1, 1), dtype=bool)
+    shapes, _ = threshold_blocks(gray, sums_of(gray), everywhere, WIDTH, 7, 7, False)
+    borders = cv2.findContours(shapes[1 : HEIGHT + 1, 1 : WIDTH + 1].copy(), cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)[0]
+    long = [one for one in borders if len(one) >= 4 and cv2.arcLength(one, True) > 23.99]
+    points, starts, areas, perimeters, _ = traced(shapes, 24.0)
+    assert len(long) == len(areas) > 0
+    for one, start, end, area, perimeter in zip(long[::-1], starts, starts[1:], areas, perimeters, strict=False):
+        np.testing.assert_array_equal(points[start:end], one[:, 0])
+        assert area == -cv2.contourArea(one, oriented=True)
+        assert perimeter == pytest.approx(cv2.arcLength(one, True), rel=1e-5)
 
 
 def test_contours_simplify_as_by_opencv():
@@ -138,12 +155,21 @@ def test_contours_simplify_as_by_opencv():
     outlines = find_outlines(adversarial("blobs")).contours
     alike = [
         np.array_equal(
-            simplified(contour[:, 0].astype(float), t * length), cv2.approxPolyDP(contour, t * length, True)[:, 0]
+            simplified(contour, t * length, len(contour)),
+            cv2.approxPolyDP(contour.astype(np.int32)[:, None], t * length, True)[:, 0],
         )
-        for length, contour in outlines
+        for length, contour in zip(outlines.perimeters, map(outlines.contour, range(outlines.count)), strict=True)
         for t in POLYGON_TOLERANCES
     ]
     assert len(alike) > 100 and np.mean(alike) > 0.99
+
+
+def test_hulls_against_opencv():
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        points = np.round(rng.normal(0, rng.uniform(1, 20), (rng.integers(3, 60), 2)))
+        around = cv2.convexHull(points.astype(np.int32))[:, 0]
+        assert sorted(map(tuple, hull(points))) == sorted(map(tuple, around))
 
 
 def test_bulges_against_the_parabolas_drawn():
@@ -180,7 +206,8 @@ def test_a_square_is_tried_again_only_if_it_reads_better_and_never_more_than_so_
     tries = Tries(3)
     assert tries.take(first) and not tries.take(first)
     assert not tries.take(replace(first, corners_px=corners + 0.1))
-    assert tries.take(replace(first, reading=Reading(3, 0, 0.71, 2)))
+    assert not tries.take(replace(first, reading=Reading(3, 0, 0.7 + 0.9 * BETTER, 2)))
+    assert tries.take(replace(first, reading=Reading(3, 0, 0.7 + 1.1 * BETTER, 2)))
     assert tries.take(replace(first, reading=Reading(4, 0, 0.6, 2)))
     assert not tries.take(replace(first, corners_px=corners + 50.0))
     assert len(tries.made) == 3
@@ -258,6 +285,16 @@ def test_what_is_done_ends_with_the_effort_an_image_is_worth(kind, monkeypatch):
     assert calls[0]["find_outlines"] <= calls[1]["find_outlines"] <= calls[2]["find_outlines"]
 
 
+@pytest.mark.parametrize("size", [(320, 240), (640, 480), (1280, 720)])
+@pytest.mark.parametrize("kind", ["noise", "blobs", "board", "JPEG", "squares"])
+def test_no_image_of_any_size_is_worth_more_than_so_many_units(kind, size):
+    image = np.tile(adversarial(kind), (3, 4))[: size[1], : size[0]]
+    detector = Detector()
+    view = detector.view(image, None)
+    assert detector.find(view) == []
+    assert view.effort.spent <= view.effort.most <= min(LEAST_UNITS + UNITS_A_PIXEL * image.size, MOST_UNITS)
+
+
 def test_effort_is_never_overspent():
     effort = Effort(1000)
     assert effort.spend(effort.most) and not effort.spend(1.0)
@@ -269,8 +306,8 @@ def test_effort_is_never_overspent():
 
 def test_noise_has_no_outlines_where_every_pixel_counts():
     noise = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
-    assert all(find_outlines(noise, how).contours == [] for how in (NARROW, TINY, SLANTED, STEEP))
-    assert len(find_outlines(noise, PLAIN).contours) <= MAX_CONTOURS
+    assert all(find_outlines(noise, how).contours.count == 0 for how in (NARROW, TINY, SLANTED, STEEP))
+    assert find_outlines(noise, PLAIN).contours.count <= MAX_CONTOURS
 
 
 def close_up(range_m: float, roll_rad: float) -> tuple[np.ndarray, Camera, np.ndarray]:

@@ -12,7 +12,7 @@ from astratag import Camera, Cylinder, Detector, Flat, Surface, Tracker, load_di
 from astratag.edges import inverse_transfer
 from astratag.geometry import square
 from astratag.matching import Match, acceptance_of_pixels, match, rough_matches
-from astratag.synthesis import Expected, Synthesis, _nodes, _picture, expected, look
+from astratag.synthesis import Expected, Synthesis, _nodes, _picture, _weighted, expected, look
 from astratag.transforms import difference, exp_so3, perturb, pose
 from astratag.warp import FittedWarp, HomographyWarp, PoseWarp
 from pipeline.render import render_marker
@@ -79,11 +79,7 @@ def test_what_is_expected_is_the_mean_of_the_artwork_under_the_blur(
     """Few nodes on a soft picture give what thousands give on a sharp one, to some hundredths of the contrast."""
     warp = PoseWarp(CAMERA, SIDE_M, Flat(), tumbled(side_px, 3, tilt_deg))
     few = looks(warp, BLUR_PX)
-    nodes = _nodes(3000)
-    moments = np.zeros((6, len(nodes)), np.float32)
-    moments[0] = 1 / len(nodes)
-    monkeypatch.setattr("astratag.synthesis._NODES", nodes)
-    monkeypatch.setattr("astratag.synthesis._MOMENTS", moments)
+    monkeypatch.setattr("astratag.synthesis._SPREAD", _weighted(_nodes(3000), np.full(3000, 1 / 3000)))
     many = looks(warp, BLUR_PX, softness=0.0)
     assert np.sqrt(np.mean((few.mean - many.mean) ** 2)) < 0.02
     assert np.abs(few.beyond - many.beyond).max() < 0.08

@@ -94,3 +94,20 @@ def test_a_marker_of_unknown_surface_is_followed_too(images: list[np.ndarray]) -
     for image in images[:3]:
         (seen,) = tracker.detect(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), CAMERA)
     assert (seen.marker_id, seen.method) == (19, "tracked")
+
+
+def test_what_other_images_showed_leaves_no_trace() -> None:
+    """A tight cylinder bulges out of the box about its corners: its edges there are this image's, too."""
+    tight, found = Cylinder(0.077, np.pi / 2), []
+    for other in (0, 255):
+        detector = Detector(surface=tight)
+        tracker = Tracker(detector)
+        for frame in range(2):
+            T = pose(FACING @ exp_so3([0.95, -0.45, 0.25]), [0.01 + 0.001 * frame, 0.0, 0.31])
+            image = render_marker(CAMERA, T, signature=SIGNATURE, side_m=0.1, surface=tight, seed=frame)
+            if frame:
+                detector.detect(np.full_like(image, other))
+            (seen,) = tracker.detect(image, CAMERA)
+        assert seen.method == "tracked"
+        found.append(seen.T_cam_marker)
+    np.testing.assert_array_equal(*found)

@@ -96,7 +96,7 @@ def measure_effective_cells(pictures: int, folder: Path | None) -> dict[str, flo
         light = cv2.LUT(picture, light_of)
         quads = np.concatenate([find_quads(picture, how) for how in (PLAIN, NARROW, FAINT, BROAD)])
         if len(quads):
-            cells.append(unit(cell_values(light, points_in(quads, SAMPLES))))
+            cells.append(unit(cell_values(picture, points_in(quads, SAMPLES), light_of.astype(float))))
         large = quads[looks_large(quads) >= LEAST_RELIT_SIDE_PX]
         if len(large):
             readings = codebook.read_seen(*relit_cells(light, points_in(large, RELIT_SAMPLES)))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.transforms import wxyz_from_rotation
+from astratag.pose import mirrored
+from astratag.transforms import inverse, wxyz_from_rotation
 from pipeline.mapping.bundle import Bundle, MapState, adjust
 from pipeline.mapping.start import MapError, first_map, is_elsewhere, start_state, together
 from pipeline.mapping.views import LEAST_MARKERS, View, chosen_views
@@ -164,23 +166,62 @@ def _require_one_map(
     edge_bias_px: float,
     ambiguity_ratio: float,
 ) -> None:
-    """Raise MapError when a marker in its other possible place explains the views almost as well."""
+    """Raise MapError when a marker in another possible place explains the views almost as well."""
     least = 2 * np.log(ambiguity_ratio)
-    for marker_id, T_target_marker in elsewhere.items():
-        mirrored = {**bundle.state.T_target_marker, marker_id: T_target_marker}
+    for start in _other_starts(views, bundle, elsewhere, reference):
         try:
-            start: MapState = start_state(views, mirrored)
-            other = adjust(views, start, reference, edge_bias_px)
+            other = adjust(views, start(), reference, edge_bias_px)
         except np.linalg.LinAlgError:
             continue
         worse = (other.cost - bundle.cost) / max(1.0, bundle.misfit)
-        apart = is_elsewhere(
-            other.state.T_target_marker[marker_id], bundle.state.T_target_marker[marker_id], bundle, marker_id
-        )
-        if apart and worse < least and sum(other.dropped.values()) <= sum(bundle.dropped.values()):
-            raise MapError(
-                f"which way marker {marker_id} is tilted on the target cannot be told: show it nearer, or more turned"
-            )
+        if worse >= least or sum(other.dropped.values()) > sum(bundle.dropped.values()):
+            continue
+        for marker_id in bundle.ids:
+            there, here = (each.state.T_target_marker[marker_id] for each in (other, bundle))
+            if is_elsewhere(there, here, bundle, marker_id):
+                raise MapError(
+                    f"which way marker {marker_id} is tilted on the target cannot be told: "
+                    "show it nearer, or more turned"
+                )
+
+
+def _other_starts(
+    views: Sequence[View], bundle: Bundle, elsewhere: Mapping[int, Array], reference: int
+) -> Iterator[Callable[[], MapState]]:
+    """Yield what makes other maps to begin with: markers elsewhere, or seen as the mirror images of what they are."""
+    for marker_id, T_target_marker in elsewhere.items():
+        yield partial(start_state, views, {**bundle.state.T_target_marker, marker_id: T_target_marker})
+    either_way = {marker_id for marker_id in (reference, *bundle.ids) if _either_way(views, marker_id)}
+    for turned in ({reference}, *({one} for one in bundle.ids), *({reference, one} for one in bundle.ids)):
+        if turned <= either_way:
+            yield partial(_mirrored, views, bundle.state, turned, reference)
+
+
+def _either_way(views: Sequence[View], marker_id: int) -> bool:
+    """Return whether a marker's corners allow two poses in most of the views that show it."""
+    two = [len(seen.poses_cam_marker) > 1 for view in views for seen in view.markers if seen.marker.id == marker_id]
+    return sum(two) >= len(two) / 2
+
+
+def _mirrored(views: Sequence[View], state: MapState, turned: Collection[int], reference: int) -> MapState:
+    """Return a map in which the ``turned`` markers look alike from afar and are tilted the other way.
+
+    Each is put where the view that is nearest to it has it then.
+    """
+    T_target_reference = state.T_target_marker[reference]
+    T_cam_target = list(state.T_cam_target)
+    if reference in turned:
+        T_cam_target = [mirrored(T @ T_target_reference) @ inverse(T_target_reference) for T in T_cam_target]
+    T_target_marker = {reference: T_target_reference}
+    for marker_id in state.T_target_marker.keys() - {reference}:
+        seen = [
+            (before @ state.T_target_marker[marker_id], after)
+            for view, before, after in zip(views, state.T_cam_target, T_cam_target, strict=True)
+            if marker_id in view.ids
+        ]
+        T_cam_marker, T_cam = min(seen, key=lambda pair: float(np.linalg.norm(pair[0][:3, 3])))
+        T_target_marker[marker_id] = inverse(T_cam) @ (mirrored(T_cam_marker) if marker_id in turned else T_cam_marker)
+    return MapState(T_target_marker, T_cam_target, state.bias_px)
 
 
 def _require_good(marker: MappedMarker, bundle: Bundle, wanted: Wanted) -> None:
