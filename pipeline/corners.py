@@ -101,13 +101,13 @@ def corner_noise(layers: Sequence[SeenLayer], noise: FilterSection) -> Array:
     """
     corners_px = np.array([layer.corners_px for layer in layers], dtype=float)
     sides_px = np.ptp(corners_px, axis=1).max(axis=1)
-    largest_px: dict[int, float] = {}
+    by_lines, largest_px = noise.edge_end_correlation != 0, dict[int, float]()
     for layer, side_px in zip(layers, sides_px.tolist(), strict=True):
         largest_px[layer.marker_id] = max(side_px, largest_px.get(layer.marker_id, 0.0))
     return _corner_noise(
         corners_px,
         np.array([layer.sigma_px for layer in layers]),
-        np.array([largest_px[layer.marker_id] >= LINES_FROM_PX for layer in layers]),
+        np.array([bool(by_lines and largest_px[layer.marker_id] >= LINES_FROM_PX) for layer in layers]),
         noise.edge_end_correlation,
         noise.lasting_sigma_px**2,
         noise.picture_shift_px**2,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from astratag.transforms import difference, exp_so3, inverse, pose, skew
 from pipeline.bound import posterior_bounds
 from pipeline.convert import points_message, pose_matrix, pose_message, vector_array
-from pipeline.corners import Eye, SeenLayer, corner_noise, outward_shift
+from pipeline.corners import Eye, SeenLayer, outward_shift
 from pipeline.dynamics import ACCELERATION, POSITION, SPEEDS, STATES, Motion, lasting_push, process_noise
 from pipeline.mission import FilterSection, FlatSection, Mission
 from pipeline.pose_filter import PoseFilter, corners_on_target
@@ -25,8 +25,16 @@ from tests.approach import CALIBRATION, CAMERA, MARKER, detections, mission, vis
 Array = NDArray[np.float64]
 SIGMA_PX = 0.15
 SETTLED_S = 2.0
-MATCHED = FilterSection(edge_bias_px=0.0, corner_bias_px=0.0, scale_sigma=0.0, picture_shift_px=0.0, correlation_s=0.1)
-"""A camera without fault, and accelerations that are new with every other picture."""
+MATCHED = FilterSection(
+    edge_bias_px=0.0,
+    corner_bias_px=0.0,
+    lasting_sigma_px=0.0,
+    edge_end_correlation=0.0,
+    scale_sigma=0.0,
+    picture_shift_px=0.0,
+    correlation_s=0.1,
+)
+"""A camera without fault, corners each with noise of its own, accelerations that are new with every other picture."""
 
 
 @dataclass(frozen=True)
@@ -109,12 +117,9 @@ def look(
     if not layers:
         return None
     centre, seen = CAMERA.K[:2, 2], []
-    exact = [SeenLayer(MARKER, layer, corners, SIGMA_PX, np.zeros((4, 3))) for layer, corners in layers.items()]
-    root = np.linalg.cholesky(corner_noise(exact, MATCHED))
-    noise_px = (root @ rng.standard_normal(len(root))).reshape(-1, 4, 2)
-    for (layer, corners), new_px in zip(layers.items(), noise_px, strict=True):
+    for layer, corners in layers.items():
         wrong = case.focal_error * (corners - centre) + case.edge_px * outward_shift(corners[None])[0] + case.shift_px
-        noisy = corners + wrong + case.corner_px * offsets_px[layer] + new_px
+        noisy = corners + wrong + case.corner_px * offsets_px[layer] + SIGMA_PX * rng.standard_normal((4, 2))
         seen.append(LayerCorners(layer=layer, corners_px=points_message(noisy), sigma_px=SIGMA_PX))
     T_cam_marker = inverse(mission_.camera.T_chaser_cam.matrix()) @ T @ mission_.markers[0].T_target_marker.matrix()
     message = pose_message(T_cam_marker)
