@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotrs, dtrtrs
 from scipy.stats import chi2
 
-from astratag.compiled import MATRIX, VECTOR, compiled
+from astratag.compiled import MATRIX, REAL, VECTOR, compiled
 from pipeline.corners import (
     CORNER_DOF,
     LINEAR_SHARE,
@@ -45,7 +45,16 @@ from pipeline.dynamics import (
     process_noise,
     right_jacobian_so3,
 )
-from pipeline.lasting import PER_LAYER, LastingErrors, decay, is_modelled, variances_px2
+from pipeline.lasting import (
+    OUTWARD,
+    PER_LAYER,
+    LastingErrors,
+    decay,
+    is_modelled,
+    shared_px2,
+    variances_px2,
+    with_new_covariance,
+)
 from pipeline.mission import FilterSection
 
 Array = NDArray[np.float64]
@@ -150,8 +159,10 @@ class CornerFilter:
         F, shares = self.motion.transition(dt_s, self.noise, own), decay(dt_s, self.noise)
         left, added = np.ones(len(P)), np.zeros(len(P))
         left[STATES:] = np.tile(shares, len(kept))
+        common_px2 = (1 - shares[OUTWARD] ** 2) * shared_px2(self.noise)
         added[STATES:] = np.tile((1 - shares**2) * variances_px2(self.noise), len(kept))
-        later = _later(np.ascontiguousarray(P), F, process_noise(dt_s, self.noise), left, added)
+        added[STATES + OUTWARD :: PER_LAYER] -= common_px2
+        later = _later(np.ascontiguousarray(P), F, process_noise(dt_s, self.noise), left, added, common_px2)
         self._P, self.lasting = later, lasting.after(dt_s, self.noise)
         self.motion = self.motion.after(dt_s, self.noise, own)
 
@@ -163,14 +174,12 @@ class CornerFilter:
 
     def know(self, layers: Sequence[SeenLayer]) -> None:
         """Make room for the lasting errors of layers that were not seen before."""
-        lasting = self.lasting.with_new([layer.key for layer in layers]) if is_modelled(self.noise) else self.lasting
-        new = len(lasting.keys) - len(self.lasting.keys)
+        if not is_modelled(self.noise):
+            return
+        known, lasting = len(self.lasting.keys), self.lasting.with_new([layer.key for layer in layers], self.noise)
+        new = len(lasting.keys) - known
         if new:
-            before, size = len(self._P), len(self._P) + PER_LAYER * new
-            P = np.zeros((size, size))
-            P[:before, :before] = self._P
-            P[np.arange(before, size), np.arange(before, size)] = np.tile(variances_px2(self.noise), new)
-            self._P, self.lasting = P, lasting
+            self._P, self.lasting = with_new_covariance(self._P, known, new, self.noise), lasting
 
     def gate(self, layers: Sequence[SeenLayer], eye: Eye) -> Array:
         """Return the normalised innovation squared of each layer by itself, infinite where it cannot be seen."""
@@ -324,9 +333,11 @@ class CornerFilter:
         return (P + P.T) / 2
 
 
-@compiled(MATRIX, MATRIX, MATRIX, VECTOR, VECTOR)
-def _later(P: Array, F: Array, Q: Array, left: Array, added: Array) -> Array:
-    """Return a covariance (N, N) later: by F and Q (21, 21) of the motion, by shares and variances (N,) of the rest."""
+@compiled(MATRIX, MATRIX, MATRIX, VECTOR, VECTOR, REAL)
+def _later(P: Array, F: Array, Q: Array, left: Array, added: Array, common_px2: float) -> Array:
+    """Return a covariance (N, N) later: by F and Q (21, 21) of the motion, by shares and variances (N,) of the rest,
+    and by what is added to all layers' outward errors alike.
+    """
     size = len(P)
     half, later = np.empty((STATES, size)), np.empty((size, size))
     for i in range(STATES):
@@ -339,6 +350,9 @@ def _later(P: Array, F: Array, Q: Array, left: Array, added: Array) -> Array:
         for j in range(STATES, size):
             later[i, j] = (half[i, j] if i < STATES else P[i, j] * left[i]) * left[j]
         later[i, i] = later[i, i] + added[i] if i >= STATES else 0.0
+    for i in range(STATES + OUTWARD, size, PER_LAYER):
+        for j in range(STATES + OUTWARD, size, PER_LAYER):
+            later[i, j] += common_px2
     for i in range(STATES):
         for j in range(STATES):
             total = Q[i, j]

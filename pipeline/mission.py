@@ -195,6 +195,8 @@ class FilterSection(Section):
     """How long both last."""
     edge_bias_px: float = Field(default=0.02, ge=0)
     """How far the edges of a black square may be measured outside or inside their place, all four by the same."""
+    edge_bias_shared: float = Field(default=0.5, ge=0, lt=1)
+    """Of that variance, what is the same for all black squares: blur and exposure are of the whole picture."""
     edge_bias_correlation_s: float = Field(default=10.0, gt=0)
     corner_bias_px: float = Field(default=0.01, ge=0)
     """How far each corner may be off by itself for long: repeated looks do not find that out."""
@@ -202,7 +204,8 @@ class FilterSection(Section):
     lasting_sigma_px: float = Field(default=0.018, ge=0)
     """How much of the sigma that a detector gives is of such errors, and not new in each picture."""
     edge_end_correlation: float = Field(default=-0.5, gt=-1, lt=1)
-    """Of what a line fitted along an edge is off at its two ends, where corners are; 0: each corner by itself."""
+    """Of what a line fitted along an edge is off at its two ends, where corners are; 0: corners are not where lines
+    meet, and each of their coordinates is off by itself."""
     corner_floor_px: float = Field(default=0.02, gt=0)
     """No corner is believed better than this."""
     scale_sigma: float = Field(default=2e-4, ge=0)

@@ -12,7 +12,7 @@ from pipeline.corner_filter import CornerFilter
 from pipeline.corners import Eye, SeenLayer, corner_noise, predicted_corners
 from pipeline.dynamics import ACCELERATION, ANGULAR_ACCELERATION, RATE, STATES, VELOCITY, Motion, process_noise
 from pipeline.hypotheses import HypothesisBank
-from pipeline.lasting import decay, variances_px2
+from pipeline.lasting import PER_LAYER, covariance_px2, decay
 from pipeline.mission import FilterSection, FlatSection
 from pipeline.pose_filter import PoseFilter, corners_on_target
 from schemas import Mode, RelativeState
@@ -52,11 +52,16 @@ def pushed(noise: FilterSection, rng: np.random.Generator) -> np.ndarray:
     return error
 
 
+def lasting_drawn(noise: FilterSection, rng: np.random.Generator) -> dict[int, np.ndarray]:
+    """Return lasting errors (9,) by layer as they are at any time."""
+    root = np.linalg.cholesky(covariance_px2(3, noise))
+    return dict(enumerate((root @ rng.standard_normal(len(root))).reshape(3, PER_LAYER)))
+
+
 def lasting_later(px: dict[int, np.ndarray], dt_s: float, noise: FilterSection, rng: np.random.Generator):
     """Return lasting errors (9,) by layer ``dt_s`` later."""
-    left = decay(dt_s, noise)
-    sigma_px = np.sqrt((1 - left**2) * variances_px2(noise))
-    return {layer: left * before + sigma_px * rng.standard_normal(len(left)) for layer, before in px.items()}
+    left, fresh = decay(dt_s, noise), lasting_drawn(noise, rng)
+    return {layer: left * before + np.sqrt(1 - left**2) * fresh[layer] for layer, before in px.items()}
 
 
 def test_consistent_with_its_own_model():
@@ -73,7 +78,7 @@ def test_consistent_with_its_own_model():
         first[VELOCITY] = noise.initial_speed_m_s * rng.standard_normal(3) / 20
         first[RATE] = noise.initial_rate_rad_s * rng.standard_normal(3) / 20
         real = Motion.at_rest(T).moved(first)
-        lasting_px = {layer: np.sqrt(variances_px2(noise)) * rng.standard_normal(9) for layer in range(3)}
+        lasting_px = lasting_drawn(noise, rng)
         pose_filter = PoseFilter(mission_)
         pose_filter.step(CALIBRATION)
         for k in range(frames):
@@ -181,8 +186,7 @@ def test_covariance_is_in_the_messages_convention():
         pose_filter = PoseFilter(mission_)
         pose_filter.step(CALIBRATION)
         rng = np.random.default_rng(seed)
-        sigma_px = np.sqrt(variances_px2(mission_.filter))
-        lasting_px = {layer: sigma_px * rng.standard_normal(9) for layer in range(3)}
+        lasting_px = lasting_drawn(mission_.filter, rng)
         for k in range(4):  # so close in time that nothing moves, and that the first look counts little
             seen = detection(mission_, T, sigma_px=0.1, rng=rng, lasting_px=lasting_px)
             state = next(iter(pose_filter.step(detections(k * 1e-6, seen))))
