@@ -17,7 +17,7 @@ from pipeline.expected import visible_layers
 from pipeline.mapping.bundle import BIAS_DOF
 from pipeline.mapping.estimate import pose_section
 from pipeline.mapping.views import View, view_of
-from pipeline.mission import CameraSection, CylinderSection, MarkerSection, Mission, PoseSection
+from pipeline.mission import CameraSection, CylinderSection, FilterSection, MarkerSection, Mission, PoseSection
 from pipeline.scenario import FACING
 from schemas import Detection, Detections, LayerCorners
 
@@ -29,6 +29,8 @@ CAMERA = Camera(
 CALIBRATION = calibration_message(CAMERA, frame_id="nav", t_capture_ns=0)
 T0_NS = 1_750_000_000_000_000_000
 SMALLEST_SIDE_PX = 16.0
+PLAIN = FilterSection(lasting_sigma_px=0.0, edge_end_correlation=0.0, picture_shift_px=0.0)
+"""Every coordinate of a corner is off by itself, as maps take it."""
 
 
 MARKERS = (
@@ -67,8 +69,9 @@ def seen_from(
     t_s: float = 0.0,
     bias_px: Mapping[int, Array] | None = None,
     only: set[int] | None = None,
+    noise: FilterSection = PLAIN,
 ) -> Detections:
-    """Return one frame's detections with the noise of lines along edges, as the mission's filter has it.
+    """Return one frame's detections, with independent noise or with what a filter section takes ``sigma_px`` for.
 
     ``bias_px`` (11,) is how far a marker's corners are measured beside their place, as in ``Corners.by_bias``.
     """
@@ -80,7 +83,7 @@ def seen_from(
         if np.ptp(expected.corners_px, axis=0).min() >= SMALLEST_SIDE_PX and (not only or expected.marker_id in only)
     ]
     exact = [SeenLayer(one.marker_id, one.layer, one.corners_px, sigma_px, np.zeros((4, 3))) for one in visible]
-    root = np.linalg.cholesky(corner_noise(exact, mission.filter)) if exact else np.zeros((0, 0))
+    root = np.linalg.cholesky(corner_noise(exact, noise)) if exact else np.zeros((0, 0))
     noise_px = (root @ rng.standard_normal(len(root))).reshape(-1, 4, 2)
     for expected, new_px in zip(visible, noise_px, strict=True):
         bias = (bias_px or {}).get(expected.marker_id, np.zeros(BIAS_DOF))
