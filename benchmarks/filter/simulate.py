@@ -75,6 +75,8 @@ class Samples:
     """Squared errors of the marker's pose in the camera: lateral (m2), axial (m2), tilt (rad2)."""
     bounds: list[Array] = field(default_factory=list)
     """The same of the bound."""
+    variances: list[Array] = field(default_factory=list)
+    """The same of the filter's own covariance."""
     nees: list[float] = field(default_factory=list)
     nis: list[tuple[float, int]] = field(default_factory=list)
     cpu_s: list[float] = field(default_factory=list)
@@ -205,10 +207,11 @@ def _keep(samples: Samples, mission_: Mission, real: Motion, state: RelativeStat
     samples.nees.append(float(whole @ np.linalg.solve(P, whole)))
     samples.nis.append((state.nis or 0.0, state.nis_dof))
     J = camera_from_target(T_cam_chaser @ T, T_target_marker)
-    error, limit = J @ whole[:6], np.diag(J @ bound[:6, :6] @ J.T)
+    error, limit, own = J @ whole[:6], np.diag(J @ bound[:6, :6] @ J.T), np.diag(J @ P[:6, :6] @ J.T)
     samples.range_m.append(float((T_cam_chaser @ T @ T_target_marker)[2, 3]))
     samples.squares.append(_by_axis(error**2))
     samples.bounds.append(_by_axis(limit))
+    samples.variances.append(_by_axis(own))
 
 
 def _by_axis(squares: Array) -> Array:
