@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.camera import Camera
+from astratag.camera import Camera, pixel, pixel_slope
 from astratag.compiled import CUBE, FLAGS, INDICES, INT, MATRIX, REAL, VECTOR, compiled
 from pipeline.dynamics import ATTITUDE, POSITION, SCALE, SHIFT, STATES, Motion
 from pipeline.lasting import CORNERS, OUTWARD, PER_LAYER
@@ -81,17 +81,16 @@ def predicted_corners(motion: Motion, layers: Sequence[SeenLayer], eye: Eye) -> 
     R_cam_chaser = eye.T_cam_chaser[:3, :3]
     R_cam_target = R_cam_chaser @ motion.R_chaser_target
     place = R_cam_chaser @ motion.p_chaser_target_m + eye.T_cam_chaser[:3, 3]
-    points_cam = points_target @ R_cam_target.T + place
-    if not np.isfinite(points_cam).all() or points_cam[:, 2].min() < NEAREST_M:
-        return None
-    centre = eye.camera.K[:2, 2]
-    off_centre = eye.camera.project(points_cam) - centre
-    by_point = (1 + motion.scale) * eye.camera.projection_jacobian(points_cam)
-    H = _derivatives(points_target, by_point, eye.T_cam_chaser, R_cam_target, off_centre)
-    pixels = centre + (1 + motion.scale) * off_centre + motion.shift_px
-    if not (np.isfinite(pixels).all() and np.isfinite(H).all()):
-        return None
-    return pixels.ravel(), H.reshape(-1, STATES)
+    pixels, H = _predicted(
+        points_target,
+        R_cam_target,
+        place,
+        np.ascontiguousarray(eye.T_cam_chaser),
+        eye.camera.lens,
+        motion.scale,
+        motion.shift_px,
+    )
+    return (pixels, H) if len(H) else None
 
 
 def corner_noise(layers: Sequence[SeenLayer], noise: FilterSection) -> Array:
@@ -162,29 +161,55 @@ def bending(motion: Motion, P_attitude: Array, layers: Sequence[SeenLayer], eye:
     return np.asarray(LASTING_LOOKS * (variance_px2 + np.outer(mean_px, mean_px)))
 
 
-@compiled(MATRIX, CUBE, MATRIX, MATRIX, MATRIX)
-def _derivatives(
-    points_target: Array, by_point: Array, T_cam_chaser: Array, R_cam_target: Array, off_centre: Array
-) -> Array:
-    """Return how pixels (N, 2) of points (N, 3) follow the error state (N, 2, 21), given how they follow the points."""
-    H = np.zeros((len(by_point), 2, STATES))
-    for n in range(len(by_point)):
+@compiled(MATRIX, MATRIX, VECTOR, MATRIX, VECTOR, REAL, VECTOR)
+def _predicted(
+    points_target: Array,
+    R_cam_target: Array,
+    place: Array,
+    T_cam_chaser: Array,
+    lens: Array,
+    scale: float,
+    shift_px: Array,
+) -> tuple[Array, Array]:
+    """Return pixels (2 N,) of points (N, 3) and their slopes (2 N, 21); no slopes at all where they make no sense."""
+    count = len(points_target)
+    pixels, H, by_point, nothing = (
+        np.empty(2 * count),
+        np.zeros((2 * count, STATES)),
+        np.empty(3),
+        np.zeros((0, STATES)),
+    )
+    for n in range(count):
         x, y, z = points_target[n]
+        right = R_cam_target[0, 0] * x + R_cam_target[0, 1] * y + R_cam_target[0, 2] * z + place[0]
+        down = R_cam_target[1, 0] * x + R_cam_target[1, 1] * y + R_cam_target[1, 2] * z + place[1]
+        ahead = R_cam_target[2, 0] * x + R_cam_target[2, 1] * y + R_cam_target[2, 2] * z + place[2]
+        if not ahead >= NEAREST_M:
+            return pixels, nothing
+        seen = pixel(right, down, ahead, lens)
         for axis in range(2):
-            for k in range(3):
-                for j in range(3):
-                    H[n, axis, FIRST_OF_POSITION + k] += by_point[n, axis, j] * T_cam_chaser[j, k]
-            a = b = c = 0.0
+            row, centre = 2 * n + axis, lens[2 + axis]
+            off_centre = seen[axis] - centre
+            pixels[row] = centre + (1 + scale) * off_centre + shift_px[axis]
+            by_point[:] = pixel_slope(right, down, ahead, lens, 1.0 - axis, 1.0 * axis)
+            a = b = c = total = 0.0
             for j in range(3):
-                a += by_point[n, axis, j] * R_cam_target[j, 0]
-                b += by_point[n, axis, j] * R_cam_target[j, 1]
-                c += by_point[n, axis, j] * R_cam_target[j, 2]
-            H[n, axis, FIRST_OF_ATTITUDE] = y * c - z * b  # a.(w x r) = (r x a).w
-            H[n, axis, FIRST_OF_ATTITUDE + 1] = z * a - x * c
-            H[n, axis, FIRST_OF_ATTITUDE + 2] = x * b - y * a
-            H[n, axis, SCALE] = off_centre[n, axis]
-            H[n, axis, FIRST_OF_SHIFT + axis] = 1.0
-    return H
+                slope = (1 + scale) * by_point[j]
+                for k in range(3):
+                    H[row, FIRST_OF_POSITION + k] += slope * T_cam_chaser[j, k]
+                a += slope * R_cam_target[j, 0]
+                b += slope * R_cam_target[j, 1]
+                c += slope * R_cam_target[j, 2]
+            H[row, FIRST_OF_ATTITUDE] = y * c - z * b  # a.(w x r) = (r x a).w
+            H[row, FIRST_OF_ATTITUDE + 1] = z * a - x * c
+            H[row, FIRST_OF_ATTITUDE + 2] = x * b - y * a
+            H[row, SCALE] = off_centre
+            H[row, FIRST_OF_SHIFT + axis] = 1.0
+            for column in range(STATES):
+                total += abs(H[row, column])
+            if not np.isfinite(total + abs(pixels[row])):
+                return pixels, nothing
+    return pixels, H
 
 
 def cross_rows(points: Array, rows: Array) -> Array:

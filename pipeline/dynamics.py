@@ -16,6 +16,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from astratag.compiled import VECTOR, compiled
 from astratag.transforms import exp_so3, log_so3, pose, rotation_from_wxyz, skew
 from pipeline.hill import clohessy_wiltshire
 from pipeline.mission import DriftSection, FilterSection
@@ -265,8 +266,25 @@ def right_jacobian_so3(theta_rad: Array) -> Array:
 
     Source: J. Sola et al., "A micro Lie theory for state estimation in robotics", 2018, eq. 143.
     """
-    angle = float(np.linalg.norm(theta_rad))
-    W = skew(theta_rad)
-    if angle < SMALL_ANGLE_RAD:
-        return np.eye(3) - W / 2 + W @ W / 6
-    return np.eye(3) - (1 - np.cos(angle)) / angle**2 * W + (angle - np.sin(angle)) / angle**3 * (W @ W)
+    return _right_jacobian_so3(np.ascontiguousarray(theta_rad, dtype=float))
+
+
+@compiled(VECTOR)
+def _right_jacobian_so3(theta_rad: Array) -> Array:
+    """Return I - a W + b W W of the skew matrix W, which is I - a W + b (theta theta' - angle^2 I)."""
+    x, y, z = theta_rad
+    angle2 = x * x + y * y + z * z
+    angle = np.sqrt(angle2)
+    a, b = 0.5, 1 / 6
+    if angle >= SMALL_ANGLE_RAD:
+        a, b = (1 - np.cos(angle)) / angle2, (angle - np.sin(angle)) / (angle2 * angle)
+    J = b * np.outer(theta_rad, theta_rad)
+    for i in range(3):
+        J[i, i] += 1 - b * angle2
+    J[0, 1] += a * z
+    J[1, 0] -= a * z
+    J[0, 2] -= a * y
+    J[2, 0] += a * y
+    J[1, 2] += a * x
+    J[2, 1] -= a * x
+    return J

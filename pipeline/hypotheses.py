@@ -314,10 +314,12 @@ def aligned_misfit(T_cam_target: Array, layers: Sequence[SeenLayer], eye: Eye, r
     H = seen[1]
     whole = np.column_stack([H[:, POSITION], H[:, ATTITUDE] @ sight, observed - seen[0]])
     white = dtrtrs(root, whole, lower=1)[0]
-    Q, _ = np.linalg.qr(white[:, :-1])
-    residual = white[:, -1]
-    along = Q.T @ residual
-    return float(residual @ residual - along @ along)
+    squares = white.T @ white
+    L, fault = dpotrf(squares[:-1, :-1], lower=1)
+    if fault:
+        return np.inf
+    along = dtrtrs(L, squares[:-1, -1], lower=1)[0]
+    return max(float(squares[-1, -1] - along @ along), 0.0)
 
 
 def mirrored(one: CornerFilter, T_target_marker: Array, eye: Eye) -> CornerFilter:
