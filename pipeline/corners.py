@@ -140,25 +140,68 @@ def bending(motion: Motion, P_attitude: Array, layers: Sequence[SeenLayer], eye:
     Second moment of the second-order term, as in R. P. Wishner, J. A. Tabaczynski, M. Athans, "A comparison of three
     non-linear filters", 1969.
     """
-    points = np.concatenate([layer.points_target for layer in layers])
+    points_target = np.concatenate([layer.points_target for layer in layers])
     R_cam_chaser = eye.T_cam_chaser[:3, :3]
-    R_cam_target = R_cam_chaser @ motion.R_chaser_target
-    centre = points.mean(axis=0)
-    depth_m = (R_cam_target @ centre + R_cam_chaser @ motion.p_chaser_target_m + eye.T_cam_chaser[:3, 3])[2]
-    px_m, arms = eye.camera.K[0, 0] / float(depth_m), points - centre
-    sigma_px = min(layer.sigma_px for layer in layers)
-    most_px = px_m * float(np.abs(arms).max()) * float(np.trace(P_attitude))
-    if np.sqrt(LASTING_LOOKS) * most_px < LINEAR_SHARE * sigma_px:
-        return None
-    # second derivatives by w_i and w_j of component k of Exp(w) a, for every arm a_n, at w = 0
-    one = np.eye(3)
-    curved = (np.einsum("ik,nj->nkij", one, arms) + np.einsum("jk,ni->nkij", one, arms)) / 2
-    curved -= np.einsum("ij,nk->nkij", one, arms)
-    bent_px = px_m * np.einsum("rk,nkij->nrij", R_cam_target[:2], curved).reshape(-1, 3, 3)
-    mean_px = np.einsum("aij,ij->a", bent_px, P_attitude) / 2
-    spread_px = bent_px @ P_attitude
-    variance_px2 = np.einsum("aij,bji->ab", spread_px, spread_px) / 2
-    return np.asarray(LASTING_LOOKS * (variance_px2 + np.outer(mean_px, mean_px)))
+    place = R_cam_chaser @ motion.p_chaser_target_m + eye.T_cam_chaser[:3, 3]
+    little_px = LINEAR_SHARE * min(layer.sigma_px for layer in layers)
+    bent = _bending(
+        points_target,
+        R_cam_chaser @ motion.R_chaser_target,
+        place,
+        np.ascontiguousarray(P_attitude),
+        float(eye.camera.K[0, 0]),
+        little_px,
+    )
+    return bent if len(bent) else None
+
+
+@compiled(MATRIX, MATRIX, VECTOR, MATRIX, REAL, REAL)
+def _bending(
+    points_target: Array, R_cam_target: Array, place: Array, P_attitude: Array, focal_px: float, little_px: float
+) -> Array:
+    """Return ``bending`` of points (N, 3), (2 N, 2 N), of no size where all moves by less than ``little_px``."""
+    count = len(points_target)
+    arms, centre, farthest_m = np.empty((count, 3)), np.zeros(3), 0.0
+    for n in range(count):
+        for k in range(3):
+            centre[k] += points_target[n, k] / count
+    for n in range(count):
+        for k in range(3):
+            arms[n, k] = points_target[n, k] - centre[k]
+            farthest_m = max(farthest_m, abs(arms[n, k]))
+    depth_m = (
+        place[2] + R_cam_target[2, 0] * centre[0] + R_cam_target[2, 1] * centre[1] + R_cam_target[2, 2] * centre[2]
+    )
+    px_m = focal_px / depth_m
+    most_px = px_m * farthest_m * (P_attitude[0, 0] + P_attitude[1, 1] + P_attitude[2, 2])
+    if np.sqrt(LASTING_LOOKS) * most_px < little_px:
+        return np.empty((0, 0))
+    mean_px, spread_px, bent_px = np.zeros(2 * count), np.zeros((2 * count, 3, 3)), np.empty((3, 3))
+    for n in range(count):
+        for axis in range(2):
+            row, along = 2 * n + axis, 0.0
+            for k in range(3):
+                along += R_cam_target[axis, k] * arms[n, k]
+            # second derivatives by w_i and w_j of Exp(w) a at w = 0 are (e_i a_j + e_j a_i) / 2, less a for i = j
+            for i in range(3):
+                for j in range(3):
+                    both = R_cam_target[axis, i] * arms[n, j] + R_cam_target[axis, j] * arms[n, i]
+                    bent_px[i, j] = px_m * (both / 2 - (along if i == j else 0.0))
+                    mean_px[row] += bent_px[i, j] * P_attitude[i, j] / 2
+            for i in range(3):
+                for j in range(3):
+                    for k in range(3):
+                        spread_px[row, i, j] += bent_px[i, k] * P_attitude[k, j]
+    bending_px2 = np.empty((2 * count, 2 * count))
+    for row in range(2 * count):
+        for column in range(row + 1):
+            variance_px2 = 0.0
+            for i in range(3):
+                for j in range(3):
+                    variance_px2 += spread_px[row, i, j] * spread_px[column, j, i] / 2
+            bending_px2[row, column] = LASTING_LOOKS * (variance_px2 + mean_px[row] * mean_px[column])
+            bending_px2[column, row] = bending_px2[row, column]
+    return bending_px2
 
 
 @compiled(MATRIX, MATRIX, VECTOR, MATRIX, VECTOR, REAL, VECTOR)
