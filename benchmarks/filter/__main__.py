@@ -37,6 +37,7 @@ HEADINGS = (
     "largest",
     "limit",
     "own",
+    "ideal",
     "NEES/12",
     "NIS",
     "CPU ms",
@@ -89,7 +90,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the first run")
     parser.add_argument("--plot", type=Path, default=Path("out/filter.png"))
     args = parser.parse_args()
-    console = Console(width=150)
+    console = Console(width=165)
     print(f"seeds {args.seed} to {args.seed + args.runs - 1}")
     if args.only in (None, "bound"):
         found = [(case, simulate(case, args.runs, args.seed)) for case in (SMALL, LARGE)]
@@ -117,7 +118,8 @@ def bound_table(found: list[tuple[Case, Samples]]) -> Table:
     """Return RMS beside the bound, a row a bin.
 
     The largest ratio comes with its standard error, from how runs differ; "own" is the largest of the standard
-    deviations that the filter claims, beside the bound: what the model costs, without the luck of a few runs.
+    deviations that the filter claims, beside the bound.  "ideal" is the largest ratio to the RMS, on the same draws, of
+    the linear filter that reaches the bound: what the filter loses, without the luck of a few runs.
     """
     table = Table(title="Pose filter: RMS, and its ratio to the posterior Cramer-Rao bound")
     for heading in HEADINGS:
@@ -131,6 +133,7 @@ def bound_table(found: list[tuple[Case, Samples]]) -> Table:
             rms = np.sqrt(np.mean(np.array(samples.squares)[chosen], axis=0))
             bound = np.sqrt(np.mean(np.array(samples.bounds)[chosen], axis=0))
             ratio, own = rms / bound, np.sqrt(np.mean(np.array(samples.variances)[chosen], axis=0)) / bound
+            beside_ideal = rms / np.sqrt(np.mean(np.array(samples.ideal)[chosen], axis=0))
             scaled = rms * (1e3, 1e3, np.rad2deg(1))
             nis, dof = np.array(samples.nis)[chosen].sum(axis=0)
             table.add_row(
@@ -140,6 +143,7 @@ def bound_table(found: list[tuple[Case, Samples]]) -> Table:
                 f"{ratio.max():.2f} ± {ratio_errors(samples, chosen)[ratio.argmax()]:.2f}",
                 f"{limit:.2f}",
                 f"{own.max():.2f}",
+                f"{beside_ideal.max():.2f}",
                 f"{np.mean(np.array(samples.nees)[chosen]) / STATE_DOF:.2f}",
                 f"{nis / dof:.2f}",
                 f"{np.median(np.array(samples.cpu_s)[chosen]) * 1e3:.2f}",
