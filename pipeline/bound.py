@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.convert import NS_PER_S
-from pipeline.corner_filter import CornerFilter, Eye, SeenLayer, predicted_corners
+from pipeline.corner_filter import CornerFilter, Look, Update
+from pipeline.corners import Eye, SeenLayer, predicted_corners
 from pipeline.dynamics import Motion
 from pipeline.mission import FilterSection
 
@@ -24,15 +25,21 @@ class Bound(CornerFilter):
     """The recursion: a filter that is told the truth before it looks."""
 
     considered = slice(0, 0)
+    gain: tuple[Array, Array] | None = None
+    """How the last look's residuals (8 L,) px move the error state (N, 8 L), and its slopes (8 L, N); None: no look."""
 
     def look(self, motion: Motion, layers: Sequence[SeenLayer], eye: Eye) -> None:
         """Take in the information that layers hold about a true motion."""
-        self.motion = motion
+        self.motion, self.gain = motion, None
         predicted = predicted_corners(motion, layers, eye) if layers else None
         if predicted is None:
             return
         corners = predicted[0].reshape(-1, 4, 2)
         self.update([replace(layer, corners_px=px) for layer, px in zip(layers, corners, strict=True)], eye)
+
+    def _accept(self, motion: Motion, error: Array, look: Look, K: Array, innovation: Array, L: Array) -> Update | None:
+        self.gain = K, look.H
+        return super()._accept(motion, error, look, K, innovation, L)
 
 
 def posterior_bounds(

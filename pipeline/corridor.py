@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.transforms import inverse, transform
+from astratag.transforms import inverse, skew, transform
 from pipeline.mission import CorridorSection, DockingBoxSection, Mission
 from schemas import PortToPort
 
@@ -37,7 +37,7 @@ def port_to_port(
 
     p = T_targetport_chaserport[:3, 3]
     p_target = transform(T_target_chaser, T_chaser_port[:3, 3])
-    v_target = -T_target_chaser[:3, :3] @ v_chaser_target_m_s - np.cross(omega_chaser_target_in_target_rad_s, p_target)
+    v_target = -T_target_chaser[:3, :3] @ v_chaser_target_m_s + skew(p_target) @ omega_chaser_target_in_target_rad_s
     v = T_port_target[:3, :3] @ v_target
 
     range_m, lateral_m = float(np.linalg.norm(p)), float(np.hypot(p[0], p[1]))

@@ -19,7 +19,7 @@ import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from numpy.typing import NDArray
 
-from astratag.transforms import exp_so3, inverse, rotation_from_wxyz
+from astratag.transforms import exp_so3, inverse, rotation_from_wxyz, wxyz_from_rotation
 from pipeline.bridge import NavigationBridge, OwnAttitude
 from pipeline.convert import NS_PER_S, calibration_message, pose_message, vector_message
 from pipeline.corridor import port_to_port
@@ -30,7 +30,19 @@ from pipeline.plant import Departure, Flight, Plant
 from pipeline.scenario import RelativeMotion
 from pipeline.sim_camera import SimCamera
 from pipeline.source import Source
-from schemas import Envelope, Guidance, Mode, Phase, RelativeState, Stamp, Truth, encode, topic_of
+from schemas import (
+    ChaserMotion,
+    Envelope,
+    Guidance,
+    Mode,
+    Phase,
+    Quaternion,
+    RelativeState,
+    Stamp,
+    Truth,
+    encode,
+    topic_of,
+)
 from schemas.codec import AnyMessage
 from schemas.topics import STATE
 
@@ -158,16 +170,28 @@ class Loop:
             omega_chaser_target_in_target_rad_s=vector_message(motion.omega_a_b_in_b_rad_s),
         )
 
-    def act(self) -> Guidance:
-        """End a tick: command, and fly to the next; at contact, all is over."""
+    def act(self) -> tuple[Guidance, ChaserMotion]:
+        """End a tick: command, and fly to the next; at contact, all is over.
+
+        Returned with the guidance is what the chaser knows of its own motion until then: what its sensors have
+        measured, and the force that it has asked for, not that which comes.
+        """
         t_ns = self.t_ns
         navigation = self.bridge.navigation(t_ns)
         command = self.autopilot.command(navigation)
+        own = navigation.own
+        w, x, y, z = wxyz_from_rotation(own.R_hill_chaser).tolist()
+        told = ChaserMotion(
+            t_capture_ns=t_ns,
+            rotation_hill_chaser_wxyz=Quaternion(w=w, x=x, y=y, z=z),
+            omega_hill_chaser_in_chaser_rad_s=vector_message(own.omega_hill_chaser_in_chaser_rad_s),
+            acceleration_chaser_m_s2=vector_message(command.force_chaser_n / self._scenario.chaser.mass_kg),
+        )
         is_contact = axial_m(self._scenario, self.flight.relative) <= 0
         if not is_contact:
             self.bridge.take_thrust(t_ns, command.acceleration_hill_m_s2)
             self._fly(command)
-        return Guidance(
+        guidance = Guidance(
             t_capture_ns=t_ns,
             phase=Phase.CONTACT if is_contact else command.phase,
             reason="the ports touch" if is_contact else command.reason,
@@ -179,6 +203,7 @@ class Loop:
             torque_chaser_n_m=vector_message(command.torque_chaser_n_m),
             delta_v_m_s=self.delta_v_m_s,
         )
+        return guidance, told
 
     def is_over(self, guidance: Guidance) -> bool:
         """Tell whether there is nothing more to come."""
@@ -228,7 +253,7 @@ class DockSource(Source):
             self._newest_state = max(self._newest_state, envelope.stamp.sequence)
 
     def envelopes(self) -> Iterator[Envelope]:
-        """Yield the calibration, then truth, frame and guidance of every tick until the flight is over.
+        """Yield the calibration, then truth, frame, guidance and own motion of every tick until the flight is over.
 
         In real time the flight begins now, and who draws the envelopes waits until each is due.
         """
@@ -249,8 +274,9 @@ class DockSource(Source):
                 yield self._wrap(image, sequence, t_ns)
             for state in self._arrived():
                 loop.bridge.take_state(state)
-            guidance = loop.act()
+            guidance, told = loop.act()
             yield self._wrap(guidance, max(sequence, 0), t_ns)
+            yield self._wrap(told, max(sequence, 0), t_ns)
             if loop.is_over(guidance):
                 return
 
@@ -312,7 +338,7 @@ def fly_on_truth(scenario: DockScenario, build_plant: BuildPlant = basilisk) -> 
             covariance=(TRUTH_SIGMA**2 * np.eye(12)).ravel().tolist(),
             age_s=0.0,
         )
-        guidance = loop.act()
+        guidance, _ = loop.act()
         ticks.append((truth, guidance))
         if loop.is_over(guidance):
             return ticks

@@ -157,8 +157,8 @@ DOCK_MISSION = Mission(
     T_target_port=PoseSection(translation_m=(0.0, 0.0, 1.0)),
     corridor=CorridorSection(start_m=20.0, port_radius_m=0.2, hold_points_m=(8.0, 2.0), keep_out_radius_m=10.0),
     filter=FilterSection(
-        acceleration_m_s2=0.03,
-        angular_acceleration_rad_s2=0.002,
+        acceleration_m_s2=0.002,
+        angular_acceleration_rad_s2=0.0003,
         edge_bias_px=0.06,
         corner_floor_px=0.03,
         one_tilt_rad=float(np.deg2rad(20)),
@@ -166,7 +166,8 @@ DOCK_MISSION = Mission(
 )
 """Camera and marker lie back in their ports, so that the marker's inner layers stay in view: 0.5 m apart at contact.
 
-From 20 m its tilt is hardly seen: the autopilot needs the place, and a covariance that stands for both tilts."""
+From 20 m its tilt is hardly seen: the autopilot needs the place, and a covariance that stands for both tilts.  The
+chaser tells its thrust, of which a few per cent are not known; the rest is what an orbit bends a straight way by."""
 
 
 class DockScenario(Section):

@@ -1,18 +1,22 @@
 """How the target moves past the chaser between two pictures, and how an error in that motion grows.
 
 The nominal motion lives outside the filter; the error state is, in this order, position (m, chaser axes), attitude
-(rad, right perturbation in target axes), velocity (m/s, chaser axes), rate (rad/s, target axes), the bias of the
-marker's edges (px, outward), and what is only considered: the share by which the focal length is off, and the constant
-shift of all pictures (px).  Drift is as the mission says, driven by white accelerations.
+(rad, right perturbation in target axes), velocity (m/s, chaser axes), rate (rad/s, target axes), acceleration (m/s2,
+chaser axes) and angular acceleration (rad/s2, target axes), and what is only considered: the share by which the focal
+length is off, and the constant shift of all pictures (px).  Drift is as the mission says; accelerations beside it last
+for a while, as first-order Gauss-Markov processes.  Source: R. A. Singer, "Estimating optimal tracking filter
+performance for manned maneuvering targets", 1970.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from astratag.compiled import VECTOR, compiled
 from astratag.transforms import exp_so3, log_so3, pose, rotation_from_wxyz, skew
 from pipeline.hill import clohessy_wiltshire
 from pipeline.mission import DriftSection, FilterSection
@@ -21,12 +25,19 @@ Array = NDArray[np.float64]
 
 POSITION, ATTITUDE, VELOCITY, RATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 MOTION = slice(0, 12)
-EDGE_BIAS, SCALE, SHIFT = 12, 13, slice(14, 16)
-CONSIDERED = slice(13, 16)
+ACCELERATION, ANGULAR_ACCELERATION = slice(12, 15), slice(15, 18)
+SCALE, SHIFT = 18, slice(19, 21)
+CONSIDERED = slice(18, 21)
 """States that are never estimated, only reckoned with: constants of the calibration (Schmidt, 1966)."""
-STATES = 16
+STATES = 21
 PLACES, SPEEDS = np.r_[POSITION, ATTITUDE], np.r_[VELOCITY, RATE]
+PUSHES = np.r_[ACCELERATION, ANGULAR_ACCELERATION]
+ESTIMATED = slice(0, 18)
 
+ORDERS = PLACES, SPEEDS, PUSHES
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
+SHORT = 1e-3
+"""Share of a correlation time below which the series of the way is exact to 1e-10."""
 SMALL_ANGLE_RAD = 1e-4
 """Below it, the series of the right Jacobian to second order is exact to 1e-13."""
 
@@ -48,13 +59,15 @@ class OwnMotion:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The nominal relative motion, and beside it what shifts the corners: edge bias, focal share, picture shift."""
+    """The nominal relative motion, and beside it what calibration leaves open: focal share, picture shift."""
 
     p_chaser_target_m: Array
     R_chaser_target: Array
     v_chaser_target_m_s: Array
     omega_chaser_target_in_target_rad_s: Array
-    edge_bias_px: float = 0.0
+    a_chaser_target_m_s2: Array = field(default_factory=lambda: np.zeros(3))
+    """Beside the drift, chaser axes."""
+    alpha_in_target_rad_s2: Array = field(default_factory=lambda: np.zeros(3))
     scale: float = 0.0
     shift_px: Array = field(default_factory=lambda: np.zeros(2))
 
@@ -68,26 +81,29 @@ class Motion:
         return pose(self.R_chaser_target, self.p_chaser_target_m)
 
     def moved(self, error: Array) -> Motion:
-        """Return this motion with an error state (16,) put in."""
+        """Return this motion with an error state (21 or more,) put in."""
         return Motion(
             self.p_chaser_target_m + error[POSITION],
             self.R_chaser_target @ exp_so3(error[ATTITUDE]),
             self.v_chaser_target_m_s + error[VELOCITY],
             self.omega_chaser_target_in_target_rad_s + error[RATE],
-            self.edge_bias_px + float(error[EDGE_BIAS]),
+            self.a_chaser_target_m_s2 + error[ACCELERATION],
+            self.alpha_in_target_rad_s2 + error[ANGULAR_ACCELERATION],
             self.scale + float(error[SCALE]),
             self.shift_px + error[SHIFT],
         )
 
     def error_of(self, other: Motion) -> Array:
-        """Return the error state (16,) with ``self.moved(error)`` equal to ``other``."""
+        """Return the error state (21,) with ``self.moved(error)`` equal to ``other``."""
         return np.concatenate(
             [
                 other.p_chaser_target_m - self.p_chaser_target_m,
                 log_so3(self.R_chaser_target.T @ other.R_chaser_target),
                 other.v_chaser_target_m_s - self.v_chaser_target_m_s,
                 other.omega_chaser_target_in_target_rad_s - self.omega_chaser_target_in_target_rad_s,
-                [other.edge_bias_px - self.edge_bias_px, other.scale - self.scale],
+                other.a_chaser_target_m_s2 - self.a_chaser_target_m_s2,
+                other.alpha_in_target_rad_s2 - self.alpha_in_target_rad_s2,
+                [other.scale - self.scale],
                 other.shift_px - self.shift_px,
             ]
         )
@@ -105,11 +121,21 @@ class Motion:
             R = self.R_chaser_target @ exp_so3(omega * dt_s)
         else:
             R, omega = free_rotation(self.R_chaser_target, omega, dt_s, noise.drift, own)
-        edge_bias_px = self.edge_bias_px * float(np.exp(-dt_s / noise.edge_bias_correlation_s))
-        return Motion(p, R, v, omega, edge_bias_px, self.scale, self.shift_px)
+        left, speed_s, way_s2 = lasting_push(dt_s, noise.correlation_s)
+        a, alpha = self.a_chaser_target_m_s2, self.alpha_in_target_rad_s2
+        return Motion(
+            p + way_s2 * a,
+            R @ exp_so3(way_s2 * alpha),
+            v + speed_s * a,
+            omega + speed_s * alpha,
+            left * a,
+            left * alpha,
+            self.scale,
+            self.shift_px,
+        )
 
     def transition(self, dt_s: float, noise: FilterSection, own: OwnMotion | None = None) -> Array:
-        """Return how an error state now becomes one ``dt_s`` later, (16, 16)."""
+        """Return how an error state now becomes one ``dt_s`` later, (21, 21)."""
         turn_rad = self.omega_chaser_target_in_target_rad_s * dt_s
         F = np.eye(STATES)
         if own is None and noise.drift.translation == "constant_velocity":
@@ -122,7 +148,11 @@ class Motion:
         F[ATTITUDE, RATE] = dt_s * right_jacobian_so3(turn_rad)
         if noise.drift.attitude == "rigid_body":
             _free_rotation_slopes(F, self, dt_s, noise.drift, own)
-        F[EDGE_BIAS, EDGE_BIAS] = np.exp(-dt_s / noise.edge_bias_correlation_s)
+        left, speed_s, way_s2 = lasting_push(dt_s, noise.correlation_s)
+        pushed_rad = way_s2 * self.alpha_in_target_rad_s2
+        F[ATTITUDE] = exp_so3(-pushed_rad) @ F[ATTITUDE]
+        F[PLACES, PUSHES], F[SPEEDS, PUSHES], F[PUSHES, PUSHES] = way_s2, speed_s, left
+        F[ATTITUDE, ANGULAR_ACCELERATION] = way_s2 * right_jacobian_so3(pushed_rad)
         return F
 
     def observed_from(self, before: OwnMotion, now: OwnMotion) -> Motion:
@@ -130,7 +160,7 @@ class Motion:
         jump = now.omega_hill_chaser_in_chaser_rad_s - before.omega_hill_chaser_in_chaser_rad_s
         return replace(
             self,
-            v_chaser_target_m_s=self.v_chaser_target_m_s - np.cross(jump, self.p_chaser_target_m),
+            v_chaser_target_m_s=self.v_chaser_target_m_s - skew(jump) @ self.p_chaser_target_m,
             omega_chaser_target_in_target_rad_s=self.omega_chaser_target_in_target_rad_s
             - self.R_chaser_target.T @ jump,
         )
@@ -170,7 +200,7 @@ def free_rotation(
 
 
 def _euler(omega: Array, inertia: Array) -> Array:
-    return -np.cross(omega, inertia * omega) / inertia
+    return -(skew(omega) @ (inertia * omega)) / inertia
 
 
 def _euler_slopes(omega: Array, inertia: Array) -> Array:
@@ -200,19 +230,34 @@ def _free_rotation_slopes(F: Array, motion: Motion, dt_s: float, drift: DriftSec
     F[RATE, RATE] = spin - own_later @ F[ATTITUDE, RATE]
 
 
-def process_noise(dt_s: float, noise: FilterSection, unseen_s: float = 0.0) -> Array:
-    """Return the covariance (16, 16) that ``dt_s`` seconds of white accelerations and of edge bias drift add.
+def lasting_push(dt_s: float, correlation_s: float) -> tuple[float, float, float]:
+    """Return what ``dt_s`` seconds leave of an acceleration, and what it adds to speed (s) and way (s2), for a unit."""
+    fade = dt_s / correlation_s
+    gone = -np.expm1(-fade)
+    way = fade - gone if fade > SHORT else fade**2 * (1 / 2 - fade / 6 + fade**2 / 24)
+    return float(1 - gone), float(correlation_s * gone), float(correlation_s**2 * way)
 
-    Measured often, accelerations are white over ``correlation_s``.  An acceleration that has not been seen for longer,
-    ``unseen_s`` seconds, has acted all the while: speeds then grow uncertain with time, not with its square root.
+
+def process_noise(dt_s: float, noise: FilterSection) -> Array:
+    """Return the covariance (21, 21) that ``dt_s`` seconds of accelerations add which were not there before.
+
+    The integral of R. A. Singer, 1970, eq. 11, by Gauss-Legendre: exact to 1e-12 up to a correlation time.
     """
-    sigmas = (noise.acceleration_m_s2, noise.angular_acceleration_rad_s2)
-    density = np.repeat(np.square(sigmas), 3) * max(noise.correlation_s, unseen_s)
+    return _process_noise(dt_s, noise.correlation_s, noise.acceleration_m_s2, noise.angular_acceleration_rad_s2)
+
+
+@lru_cache(maxsize=64)
+def _process_noise(dt_s: float, correlation_s: float, acceleration: float, angular_acceleration: float) -> Array:
+    """Return the same, shared and not to be written to: frames come at few different intervals."""
+    ages_s, weights = dt_s / 2 * (1 + NODES), dt_s / 2 * WEIGHTS
+    pushes = np.array([lasting_push(float(age_s), correlation_s)[::-1] for age_s in ages_s])
+    added = 2 / correlation_s * (pushes.T * weights) @ pushes
+    variances = np.repeat(np.square((acceleration, angular_acceleration)), 3)
     Q = np.zeros((STATES, STATES))
-    Q[PLACES, PLACES] = density * (dt_s**3 / 3)
-    Q[PLACES, SPEEDS] = Q[SPEEDS, PLACES] = density * (dt_s**2 / 2)
-    Q[SPEEDS, SPEEDS] = density * dt_s
-    Q[EDGE_BIAS, EDGE_BIAS] = -(noise.edge_bias_px**2) * np.expm1(-2 * dt_s / noise.edge_bias_correlation_s)
+    for i, rows in enumerate(ORDERS):
+        for j, columns in enumerate(ORDERS):
+            Q[rows, columns] = added[i, j] * variances
+    Q.setflags(write=False)
     return Q
 
 
@@ -221,8 +266,25 @@ def right_jacobian_so3(theta_rad: Array) -> Array:
 
     Source: J. Sola et al., "A micro Lie theory for state estimation in robotics", 2018, eq. 143.
     """
-    angle = float(np.linalg.norm(theta_rad))
-    W = skew(theta_rad)
-    if angle < SMALL_ANGLE_RAD:
-        return np.eye(3) - W / 2 + W @ W / 6
-    return np.eye(3) - (1 - np.cos(angle)) / angle**2 * W + (angle - np.sin(angle)) / angle**3 * (W @ W)
+    return _right_jacobian_so3(np.ascontiguousarray(theta_rad, dtype=float))
+
+
+@compiled(VECTOR)
+def _right_jacobian_so3(theta_rad: Array) -> Array:
+    """Return I - a W + b W W of the skew matrix W, which is I - a W + b (theta theta' - angle^2 I)."""
+    x, y, z = theta_rad
+    angle2 = x * x + y * y + z * z
+    angle = np.sqrt(angle2)
+    a, b = 0.5, 1 / 6
+    if angle >= SMALL_ANGLE_RAD:
+        a, b = (1 - np.cos(angle)) / angle2, (angle - np.sin(angle)) / (angle2 * angle)
+    J = b * np.outer(theta_rad, theta_rad)
+    for i in range(3):
+        J[i, i] += 1 - b * angle2
+    J[0, 1] += a * z
+    J[1, 0] -= a * z
+    J[0, 2] -= a * y
+    J[2, 0] += a * y
+    J[1, 2] += a * x
+    J[2, 1] -= a * x
+    return J

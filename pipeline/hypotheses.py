@@ -14,10 +14,21 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from astratag.transforms import inverse, skew
-from pipeline.corner_filter import CORNER_DOF, CornerFilter, Eye, SeenLayer, Update, predicted_corners
-from pipeline.dynamics import ATTITUDE, POSITION, RATE, STATES, VELOCITY, Motion, OwnMotion
+from pipeline.corner_filter import CornerFilter, Update
+from pipeline.corners import CORNER_DOF, Eye, SeenLayer, corner_noise, predicted_corners
+from pipeline.dynamics import (
+    ACCELERATION,
+    ANGULAR_ACCELERATION,
+    ATTITUDE,
+    POSITION,
+    RATE,
+    VELOCITY,
+    Motion,
+    OwnMotion,
+)
 from pipeline.mission import FilterSection
 
 Array = NDArray[np.float64]
@@ -140,10 +151,10 @@ class HypothesisBank:
         bank.filters, bank._log_weights = [f.copy() for f in self.filters], list(self._log_weights)
         return bank
 
-    def predict(self, dt_s: float, unseen_s: float = 0.0, own: OwnMotion | None = None) -> None:
-        """Let ``dt_s`` seconds pass, at the end of which nothing was measured for ``unseen_s`` seconds."""
+    def predict(self, dt_s: float, own: OwnMotion | None = None) -> None:
+        """Let ``dt_s`` seconds pass."""
         for hypothesis in self.filters:
-            hypothesis.predict(dt_s, unseen_s, own)
+            hypothesis.predict(dt_s, own)
 
     def observe_from(self, before: OwnMotion, now: OwnMotion) -> None:
         """Have the chaser's own rate change, which is known."""
@@ -192,9 +203,10 @@ class HypothesisBank:
         along = tilt if np.linalg.norm(tilt) > 1e-6 else np.cross(sight, [0.0, 1.0, 0.0])
         along = along / np.linalg.norm(along)
         leaning = np.zeros(3)
+        root, _ = dpotrf(corner_noise(layers, self._noise), lower=1)
         for way in (along, np.cross(sight, along)):
             poses = [tilted_pose(T, sign * size * way) @ T_marker_target for sign in (1, -1)]
-            one, other = (aligned_misfit(pose, layers, eye) for pose in poses)
+            one, other = (aligned_misfit(pose, layers, eye, root) for pose in poses)
             if np.isfinite(one) and np.isfinite(other):
                 leaning += (other - one) / (4 * size) * way
         return leaning
@@ -202,13 +214,13 @@ class HypothesisBank:
     def _weigh_mirrored(self, leaning: Array, layers: Sequence[SeenLayer], eye: Eye) -> None:
         """Take in what a look says for the tilts, and follow the mirror image too where that fits better.
 
-        Corners that are off for long by ``corner_bias_px`` repeat themselves: many looks then count like few.
+        What lasts of the corners' errors repeats itself: many looks then count like few.
         """
         fade = 1 - 1 / LOOKS
         self._leaning, self._looks = fade[:, None] * self._leaning + leaning, fade * self._looks + 1
         sigma_px = min(layer.sigma_px for layer in layers)
         tilt = tilt_of(eye.T_cam_chaser @ self.best.motion.pose_chaser_target() @ self._T_target_marker)
-        repeated = 1 + self._looks * (self._noise.corner_bias_px / sigma_px) ** 2
+        repeated = 1 + self._looks * (self._noise.lasting_sigma_px / sigma_px) ** 2
         self._evidence = float(np.max(2 * self._leaning @ tilt / repeated))
         image = mirrored(self.best, self._T_target_marker, eye)
         self._is_one_mode = is_one_mode(self.best, image, self._noise)
@@ -287,23 +299,27 @@ def tilted_pose(T_cam_marker: Array, tilt: Array) -> Array:
     return T
 
 
-def aligned_misfit(T_cam_target: Array, layers: Sequence[SeenLayer], eye: Eye) -> float:
-    """Return the squared residuals, in units of their variance, of a pose moved and rolled to fit as well as it can.
+def aligned_misfit(T_cam_target: Array, layers: Sequence[SeenLayer], eye: Eye, root: Array) -> float:
+    """Return the squared residuals, in units of their noise, of a pose moved and rolled to fit as well as it can.
 
-    Where a print is and how it is rolled was found with one tilt: held fast, it would speak for that.
+    Where a print is and how it is rolled was found with one tilt: held fast, it would speak for that.  ``root``
+    (8 L, 8 L) is the lower Cholesky factor of the corners' noise.
     """
     motion = Motion.at_rest(inverse(eye.T_cam_chaser) @ T_cam_target)
     seen = predicted_corners(motion, layers, eye)
     if seen is None:
         return np.inf
-    sigma = np.repeat([layer.sigma_px for layer in layers], CORNER_DOF)
-    residual = (np.concatenate([layer.corners_px.ravel() for layer in layers]) - seen[0]) / sigma
-    H = seen[1] / sigma[:, None]
+    observed = np.concatenate([layer.corners_px.ravel() for layer in layers])
     sight = motion.R_chaser_target.T @ eye.T_cam_chaser[:3, :3].T @ T_cam_target[:3, 3]
-    free = np.column_stack([H[:, POSITION], H[:, ATTITUDE] @ sight])
-    Q, _ = np.linalg.qr(free)
-    along = Q.T @ residual
-    return float(residual @ residual - along @ along)
+    H = seen[1]
+    whole = np.column_stack([H[:, POSITION], H[:, ATTITUDE] @ sight, observed - seen[0]])
+    white = dtrtrs(root, whole, lower=1)[0]
+    squares = white.T @ white
+    L, fault = dpotrf(squares[:-1, :-1], lower=1)
+    if fault:
+        return np.inf
+    along = dtrtrs(L, squares[:-1, -1], lower=1)[0]
+    return max(float(squares[-1, -1] - along @ along), 0.0)
 
 
 def mirrored(one: CornerFilter, T_target_marker: Array, eye: Eye) -> CornerFilter:
@@ -314,24 +330,29 @@ def mirrored(one: CornerFilter, T_target_marker: Array, eye: Eye) -> CornerFilte
     R = eye.T_cam_chaser[:3, :3].T @ mirrored_pose(T_cam_marker)[:3, :3] @ R_target_marker.T
     reversed_ = -R_target_marker @ MIRROR @ R_target_marker.T  # M R Exp(d) D = (M R D) Exp(-D d)
     omega = reversed_ @ motion.omega_chaser_target_in_target_rad_s
-    by_lever = R @ skew(place_target) @ reversed_ - motion.R_chaser_target @ skew(place_target)
-    J = np.eye(STATES)
-    J[ATTITUDE, ATTITUDE] = J[RATE, RATE] = reversed_
-    J[POSITION, ATTITUDE] = J[VELOCITY, RATE] = by_lever
+    alpha = reversed_ @ motion.alpha_in_target_rad_s2
+    arm = skew(place_target)
+    by_lever = R @ arm @ reversed_ - motion.R_chaser_target @ arm
+    J = np.eye(len(one.covariance))
+    for turn, way in ((ATTITUDE, POSITION), (RATE, VELOCITY), (ANGULAR_ACCELERATION, ACCELERATION)):
+        J[turn, turn], J[way, turn] = reversed_, by_lever
     p = motion.p_chaser_target_m + (motion.R_chaser_target - R) @ place_target
     v = (
         motion.v_chaser_target_m_s
-        + motion.R_chaser_target @ np.cross(motion.omega_chaser_target_in_target_rad_s, place_target)
-        - R @ np.cross(omega, place_target)
+        - motion.R_chaser_target @ arm @ motion.omega_chaser_target_in_target_rad_s
+        + R @ arm @ omega
     )
+    a = motion.a_chaser_target_m_s2 - motion.R_chaser_target @ arm @ motion.alpha_in_target_rad_s2 + R @ arm @ alpha
     moved = replace(
         motion,
         p_chaser_target_m=p,
         R_chaser_target=R,
         v_chaser_target_m_s=v,
         omega_chaser_target_in_target_rad_s=omega,
+        a_chaser_target_m_s2=a,
+        alpha_in_target_rad_s2=alpha,
     )
-    return CornerFilter(moved, J @ one.covariance @ J.T, one.noise)
+    return CornerFilter(moved, J @ one.covariance @ J.T, one.noise, one.lasting)
 
 
 def guesses_in_chaser(poses_cam_marker: Sequence[Array], eye: Eye, T_marker_target: Array) -> list[Array]:

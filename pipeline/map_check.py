@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from astratag.camera import Camera
 from astratag.transforms import difference, inverse, perturb, transform
-from pipeline.corner_filter import CORNER_DOF, NEAREST_M, cross_rows, gate_limit
+from pipeline.corner_filter import gate_limit
+from pipeline.corners import CORNER_DOF, NEAREST_M, cross_rows
 from pipeline.mapping.views import LEAST_MARKERS, View, view_of
 from pipeline.mission import Mission
 from schemas import Detections

@@ -188,27 +188,36 @@ class FilterSection(Section):
 
     drift: DriftSection = DriftSection()
 
-    acceleration_m_s2: float = Field(default=0.005, gt=0)
-    """Standard deviation of the relative acceleration, white over ``correlation_s``: slow approaches without burns."""
-    angular_acceleration_rad_s2: float = Field(default=0.015, gt=0)
-    correlation_s: float = Field(default=0.2, gt=0)
-    edge_bias_px: float = Field(default=0.03, ge=0)
-    """How far the edges of every black square may be measured outside or inside their place, all by the same."""
-    edge_bias_correlation_s: float = Field(default=5.0, gt=0)
-    corner_bias_px: float = Field(default=0.02, ge=0)
-    """How far each corner may be off by itself for long: repeated looks then tell two poses apart no better."""
+    acceleration_m_s2: float = Field(default=0.003, gt=0)
+    """Standard deviation of the relative acceleration, along each axis: slow approaches without burns."""
+    angular_acceleration_rad_s2: float = Field(default=0.01, gt=0)
+    correlation_s: float = Field(default=5.0, gt=0)
+    """How long both last."""
+    edge_bias_px: float = Field(default=0.02, ge=0)
+    """How far the edges of a black square may be measured outside or inside their place, all four by the same."""
+    edge_bias_shared: float = Field(default=0.5, ge=0, lt=1)
+    """Of that variance, what is the same for all black squares: blur and exposure are of the whole picture."""
+    edge_bias_correlation_s: float = Field(default=10.0, gt=0)
+    corner_bias_px: float = Field(default=0.01, ge=0)
+    """How far each corner may be off by itself for long: repeated looks do not find that out."""
+    corner_bias_correlation_s: float = Field(default=2.0, gt=0)
+    lasting_sigma_px: float = Field(default=0.018, ge=0)
+    """How much of the sigma that a detector gives is of such errors, and not new in each picture."""
+    edge_end_correlation: float = Field(default=-0.5, gt=-1, lt=1)
+    """Of what a line fitted along an edge is off at its two ends, where corners are; 0: corners are not where lines
+    meet, and each of their coordinates is off by itself."""
     corner_floor_px: float = Field(default=0.02, gt=0)
     """No corner is believed better than this."""
     scale_sigma: float = Field(default=2e-4, ge=0)
     """How far the focal length, as a share of itself, may be off, or the marker's size: constant, considered."""
     image_shift_px: float = Field(default=0.0, ge=0)
     """How far all pictures may be shifted alike, by a principal point that is off: constant, considered."""
-    picture_shift_px: float = Field(default=0.05, ge=0)
+    picture_shift_px: float = Field(default=0.01, ge=0)
     """How far a whole picture may be shifted: vibration, a late stamp, what compression does to parallel edges."""
     initial_speed_m_s: float = Field(default=0.2, gt=0)
     initial_rate_rad_s: float = Field(default=0.2, gt=0)
-    gate_probability: float = Field(default=0.999, gt=0.5, lt=1)
-    """Share of true measurements that a gate lets through."""
+    gate_probability: float = Field(default=0.999999, gt=0.5, lt=1)
+    """Share of true measurements that a gate lets through: layers whose sigma is half too small must pass it too."""
     ambiguity_ratio: float = Field(default=1e4, gt=1)
     """How many times likelier one of two poses must become before the other is dropped."""
     one_tilt_rad: float = Field(default=float(np.deg2rad(2.0)), ge=0)

@@ -8,7 +8,6 @@ the state's ``rejections``, as "kind: detail", the kinds being "calibration", "s
 
 from __future__ import annotations
 
-from bisect import bisect_right, insort
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -20,24 +19,24 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from numpy.typing import NDArray
 
 from astratag.geometry import layer_corners_print
-from astratag.transforms import inverse, rotation_from_wxyz, transform, wxyz_from_rotation
+from astratag.transforms import inverse, transform, wxyz_from_rotation
 from pipeline.convert import (
     NS_PER_S,
     camera_from_calibration,
     points_array,
     pose_matrix,
     pose_message,
-    vector_array,
     vector_message,
 )
-from pipeline.corner_filter import CORNER_DOF, NEAREST_M, Eye, SeenLayer, Update, gate_limit
+from pipeline.corner_filter import Update, gate_limit
+from pipeline.corners import CORNER_DOF, NEAREST_M, Eye, SeenLayer
 from pipeline.corridor import port_to_port
-from pipeline.dynamics import OwnMotion
 from pipeline.history import History
 from pipeline.hypotheses import HypothesisBank, guesses_in_chaser
 from pipeline.map_check import MapCheck, Verdict
 from pipeline.mission import MarkerSection, Mission
-from schemas import ChaserMotion, Detection, Detections, Mode, Quaternion, RelativeState
+from pipeline.own_motion import OwnMotions
+from schemas import ChaserMotion, Detection, Detections, Mode, RelativeState
 from schemas.codec import AnyMessage
 
 Array = NDArray[np.float64]
@@ -50,7 +49,6 @@ FARTHEST_M = 1e5
 OVERDUE_PERIODS = 2.5
 """A measurement is overdue when it is older than so many usual periods between frames."""
 PERIODS_KEPT = 9
-OWN_KEPT = 256
 
 
 @dataclass
@@ -105,8 +103,7 @@ class PoseFilter:
         self._map_check = MapCheck(mission)
         self._track = Track(self._mapped())
         self._history: History[Detections, Track] = History(round(mission.filter.history_s * NS_PER_S))
-        self._own: list[tuple[int, OwnMotion]] = []
-        """The chaser's own motion from each time on."""
+        self._own = OwnMotions(mission.filter.drift)
         self._periods_ns: deque[int] = deque(maxlen=PERIODS_KEPT)
         self._update: Update | None = None
         self._late_frames = 0
@@ -133,7 +130,7 @@ class PoseFilter:
             self._camera_frame = message.frame_id or self._mission.camera.name
             return []
         if isinstance(message, ChaserMotion):
-            self._take_own(message)
+            self._own.take(message)
         if not isinstance(message, Detections):
             return []
         with np.errstate(all="ignore"):  # what overflows is refused where it shows
@@ -249,30 +246,10 @@ class PoseFilter:
     def _predict(self, track: Track, t_ns: int) -> None:
         """Propagate to ``t_ns``, by what the chaser did meanwhile if that is known."""
         assert track.bank is not None and track.t_ns is not None
-        unseen_s, now_ns = track.age_s(t_ns) or 0.0, track.t_ns
-        at = bisect_right(self._own, now_ns, key=lambda known: known[0])
-        own = self._own[at - 1][1] if at else None
-        for change_ns, then in self._own[at:]:
-            if change_ns >= t_ns:
-                break
-            track.bank.predict((change_ns - now_ns) / NS_PER_S, unseen_s, own)
-            if own is not None:
-                track.bank.observe_from(own, then)
-            now_ns, own = change_ns, then
-        track.bank.predict((t_ns - now_ns) / NS_PER_S, unseen_s, own)
-
-    def _take_own(self, message: ChaserMotion) -> None:
-        """Note the chaser's own motion from its time on; what it says of times gone by counts for late frames only."""
-        drift = OwnMotion.of(self._settings.drift)
-        own = OwnMotion(
-            drift.R_hill_chaser
-            if message.rotation_hill_chaser_wxyz is None
-            else _rotation(message.rotation_hill_chaser_wxyz),
-            vector_array(message.omega_hill_chaser_in_chaser_rad_s),
-            vector_array(message.acceleration_chaser_m_s2),
-        )
-        insort(self._own, (message.t_capture_ns, own), key=lambda known: known[0])
-        del self._own[:-OWN_KEPT]
+        for stretch in self._own.stretches(track.t_ns, t_ns):
+            track.bank.predict(stretch.dt_s, stretch.own)
+            if stretch.own is not None and stretch.then is not None:
+                track.bank.observe_from(stretch.own, stretch.then)
 
     def _usable_layers(
         self, track: Track, message: Detections, frame: Frame
@@ -470,7 +447,3 @@ def first_guesses(detection: Detection) -> list[Array]:
 
 def _extent_px(corners_px: Array) -> float:
     return float(np.ptp(corners_px, axis=0).max())
-
-
-def _rotation(q: Quaternion) -> Array:
-    return rotation_from_wxyz((q.w, q.x, q.y, q.z))

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict
 from astratag.transforms import inverse
 from pipeline.bound import posterior_bounds
 from pipeline.convert import pose_matrix, vector_array
-from pipeline.corner_filter import Eye, SeenLayer
+from pipeline.corners import Eye, SeenLayer
 from pipeline.dynamics import Motion
 from pipeline.pose_filter import corners_on_target
 from pipeline.run import ATTITUDE, POSITION, Row, Run

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from astratag.transforms import inverse
 from pipeline.convert import (
-    NS_PER_S,
     camera_from_calibration,
     points_array,
     pose_matrix,
@@ -23,14 +22,16 @@ from pipeline.convert import (
     vector_array,
     vector_message,
 )
-from pipeline.corner_filter import CornerFilter, Eye, SeenLayer
+from pipeline.corner_filter import CornerFilter
+from pipeline.corners import Eye, SeenLayer
 from pipeline.corridor import port_to_port
 from pipeline.dynamics import Motion
 from pipeline.mission import MarkerSection, Mission
+from pipeline.own_motion import OwnMotions
 from pipeline.pose_filter import corners_on_target
 from pipeline.recording import Recording, RecordingWriter
 from schemas import Detections, Envelope, Mode, RelativeState
-from schemas.topics import DETECTIONS, STATE, TRANSFORMS
+from schemas.topics import CHASER_MOTION, DETECTIONS, STATE, TRANSFORMS
 
 Array = NDArray[np.float64]
 SMOOTHED_MODES = (Mode.TRACK, Mode.COAST)
@@ -40,6 +41,7 @@ class FullFilter(CornerFilter):
     """A filter that estimates all it can: what a calibration leaves open is seen better from a whole run."""
 
     considered = slice(0, 0)
+    forgets = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,38 +50,40 @@ class Passed:
 
     t_ns: int
     F: Array
-    predicted: Motion
-    P_predicted: Array
-    motion: Motion
-    P: Array
+    predicted: FullFilter
+    after: FullFilter
 
 
 def smooth(
-    frames: Sequence[tuple[RelativeState, Sequence[SeenLayer]]], eye: Eye, mission: Mission
+    frames: Sequence[tuple[RelativeState, Sequence[SeenLayer]]],
+    eye: Eye,
+    mission: Mission,
+    own: OwnMotions | None = None,
 ) -> Iterator[RelativeState]:
     """Yield the smoothed states of frames that follow each other, the last first.
 
-    Each frame has the state that the filter made of it and the layers that it used.
+    Each frame has the state that the filter made of it and the layers that it used; ``own`` is what the chaser told of
+    its own motion.
     """
-    passed = _forward(frames, eye, mission)
-    later: tuple[Motion, Array] | None = None
+    passed = _forward(frames, eye, mission, OwnMotions(mission.filter.drift) if own is None else own)
+    later: FullFilter | None = None
     for k in range(len(frames) - 1, -1, -1):
-        now = passed[k]
-        motion, P = now.motion, now.P
+        now = passed[k].after
         if later is not None:
-            ahead = passed[k + 1]
-            known = np.flatnonzero(np.diag(ahead.P_predicted) > 0)
+            ahead, P_ahead, P = passed[k + 1], passed[k + 1].predicted.covariance, now.covariance
+            known = np.flatnonzero(np.diag(P_ahead) > 0)
             C = np.zeros_like(P)
-            across = ahead.F @ now.P
-            C[:, known] = np.linalg.solve(ahead.P_predicted[np.ix_(known, known)], across[known]).T
-            motion = now.motion.moved(C @ ahead.predicted.error_of(later[0]))
-            P = now.P + C @ (later[1] - ahead.P_predicted) @ C.T
-            P = (P + P.T) / 2
-        later = motion, P
-        yield _told(frames[k][0], FullFilter(motion, P, mission.filter), mission)
+            across = ahead.F @ P
+            C[:, known] = np.linalg.solve(P_ahead[np.ix_(known, known)], across[known]).T
+            P = P + C @ (later.covariance - P_ahead) @ C.T
+            now = now.moved(C @ ahead.predicted.error_of(later), (P + P.T) / 2)
+        later = now
+        yield _told(frames[k][0], now, mission)
 
 
-def _forward(frames: Sequence[tuple[RelativeState, Sequence[SeenLayer]]], eye: Eye, mission: Mission) -> list[Passed]:
+def _forward(
+    frames: Sequence[tuple[RelativeState, Sequence[SeenLayer]]], eye: Eye, mission: Mission, own: OwnMotions
+) -> list[Passed]:
     first = frames[0][0]
     assert first.T_chaser_target is not None
     T_chaser_target = pose_matrix(first.T_chaser_target)
@@ -92,19 +96,20 @@ def _forward(frames: Sequence[tuple[RelativeState, Sequence[SeenLayer]]], eye: E
             vector_array(first.v_chaser_target_m_s),
             vector_array(first.omega_chaser_target_in_target_rad_s),
         )
+    filter_.know([layer for _, layers in frames for layer in layers])
     passed: list[Passed] = []
-    t_measured_ns = first.t_capture_ns
     for state, layers in frames:
         t_ns = state.t_capture_ns
         F = np.eye(len(filter_.covariance))
-        if passed:
-            dt_s = (t_ns - passed[-1].t_ns) / NS_PER_S
-            F = filter_.motion.transition(dt_s, mission.filter)
-            filter_.predict(dt_s, (t_ns - t_measured_ns) / NS_PER_S)
-        predicted, P_predicted = filter_.motion, filter_.covariance
-        if layers and filter_.update(layers, eye) is not None:
-            t_measured_ns = t_ns
-        passed.append(Passed(t_ns, F, predicted, P_predicted, filter_.motion, filter_.covariance))
+        for stretch in own.stretches(passed[-1].t_ns, t_ns) if passed else ():
+            F = filter_.transition(stretch.dt_s, stretch.own) @ F
+            filter_.predict(stretch.dt_s, stretch.own)
+            if stretch.own is not None and stretch.then is not None:
+                filter_.motion = filter_.motion.observed_from(stretch.own, stretch.then)
+        predicted = filter_.copy()
+        if layers:
+            filter_.update(layers, eye)
+        passed.append(Passed(t_ns, F, predicted, filter_.copy()))
     return passed
 
 
@@ -161,6 +166,9 @@ def _smoothed(recording: Recording) -> Iterator[RelativeState]:
     mission = recording.mission
     eye = Eye(camera_from_calibration(recording.calibration), inverse(mission.camera.T_chaser_cam.matrix()))
     seen = {message.t_capture_ns: message for message in recording.messages(DETECTIONS)}
+    own = OwnMotions(mission.filter.drift, kept=None)
+    for told in recording.messages(CHASER_MOTION):
+        own.take(told)
     stretch: list[tuple[RelativeState, list[SeenLayer]]] = []
     for state in recording.messages(STATE):
         message = seen.get(state.t_capture_ns)
@@ -170,10 +178,10 @@ def _smoothed(recording: Recording) -> Iterator[RelativeState]:
             stretch.append((state, list(_used(state, message, mission))))
             continue
         if stretch:
-            yield from smooth(stretch, eye, mission)
+            yield from smooth(stretch, eye, mission, own)
         stretch = []
     if stretch:
-        yield from smooth(stretch, eye, mission)
+        yield from smooth(stretch, eye, mission, own)
 
 
 def _used(state: RelativeState, message: Detections, mission: Mission) -> Iterator[SeenLayer]:

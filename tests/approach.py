@@ -5,6 +5,7 @@ The motion is ``pipeline.scenario``'s; there are no pictures, corners come from 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from astratag.camera import Camera
 from astratag.geometry import LAYERS
 from astratag.transforms import inverse, transform
 from pipeline.convert import calibration_message, points_message, pose_message
-from pipeline.corner_filter import outward_shift
+from pipeline.corners import SeenLayer, corner_noise, outward_shift
+from pipeline.lasting import CORNERS, OUTWARD
 from pipeline.mission import CameraSection, CylinderSection, FlatSection, MarkerSection, Mission, PoseSection
 from pipeline.pose_filter import corners_on_target
 from pipeline.scenario import Approach, RelativeMotion
@@ -73,23 +75,31 @@ def detection(
     sigma_px: float,
     rng: np.random.Generator | None = None,
     bias_px: float = 0.0,
+    lasting_px: Mapping[int, Array] | None = None,
 ) -> Detection | None:
-    """Return what a detector makes of a true pose, with noise of ``sigma_px`` when there is an ``rng``.
+    """Return what a detector makes of a true pose, with noise when there is an ``rng``.
 
-    With the noise comes the shift of the whole picture that the mission's filter reckons with.  The detection's pose is
-    the true one, as a refined pose would be to a few sigma.
+    The noise is what the mission's filter takes ``sigma_px`` for, less what lasts: ``lasting_px`` (9,) by layer, as in
+    ``pipeline.lasting``, or an edge bias alone.  The detection's pose is the true one, as a refined pose would be to a
+    few sigma.
     """
     layers = visible_layers(mission_, T_chaser_target)
     if not layers:
         return None
     marker = mission_.markers[0]
     T_cam_marker = inverse(mission_.camera.T_chaser_cam.matrix()) @ T_chaser_target @ marker.T_target_marker.matrix()
-    shift_px = np.zeros(2) if rng is None else mission_.filter.picture_shift_px * rng.standard_normal(2)
+    noise_px = np.zeros((len(layers), 4, 2))
+    if rng is not None:
+        exact = [SeenLayer(marker.id, layer, px, sigma_px, np.zeros((4, 3))) for layer, px in layers.items()]
+        root = np.linalg.cholesky(corner_noise(exact, mission_.filter))
+        noise_px = (root @ rng.standard_normal(len(root))).reshape(noise_px.shape)
     measured = []
-    for layer, corners in layers.items():
-        shifted = corners + bias_px * outward_shift(corners[None])[0]
-        noisy = shifted if rng is None else shifted + shift_px + sigma_px * rng.standard_normal((4, 2))
-        measured.append(LayerCorners(layer=layer, corners_px=points_message(noisy), sigma_px=sigma_px))
+    for (layer, corners), new_px in zip(layers.items(), noise_px, strict=True):
+        off_px = bias_px * outward_shift(corners[None])[0] + new_px
+        if lasting_px is not None:
+            off_px += lasting_px[layer][OUTWARD] * outward_shift(corners[None])[0]
+            off_px += lasting_px[layer][CORNERS].reshape(4, 2)
+        measured.append(LayerCorners(layer=layer, corners_px=points_message(corners + off_px), sigma_px=sigma_px))
     return Detection(
         family="astratag20",
         marker_id=marker.id,

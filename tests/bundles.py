@@ -12,12 +12,12 @@ from astratag.detection import LayerDetection
 from astratag.pose import planar_poses
 from astratag.transforms import exp_so3, pose
 from pipeline.convert import calibration_message, points_message, pose_message
-from pipeline.corner_filter import outward_shift
+from pipeline.corners import SeenLayer, corner_noise, outward_shift
 from pipeline.expected import visible_layers
 from pipeline.mapping.bundle import BIAS_DOF
 from pipeline.mapping.estimate import pose_section
 from pipeline.mapping.views import View, view_of
-from pipeline.mission import CameraSection, CylinderSection, MarkerSection, Mission, PoseSection
+from pipeline.mission import CameraSection, CylinderSection, FilterSection, MarkerSection, Mission, PoseSection
 from pipeline.scenario import FACING
 from schemas import Detection, Detections, LayerCorners
 
@@ -29,6 +29,8 @@ CAMERA = Camera(
 CALIBRATION = calibration_message(CAMERA, frame_id="nav", t_capture_ns=0)
 T0_NS = 1_750_000_000_000_000_000
 SMALLEST_SIDE_PX = 16.0
+PLAIN = FilterSection(lasting_sigma_px=0.0, edge_end_correlation=0.0, picture_shift_px=0.0)
+"""Every coordinate of a corner is off by itself, as maps take it."""
 
 
 MARKERS = (
@@ -67,21 +69,28 @@ def seen_from(
     t_s: float = 0.0,
     bias_px: Mapping[int, Array] | None = None,
     only: set[int] | None = None,
+    noise: FilterSection = PLAIN,
 ) -> Detections:
-    """Return one frame's detections with Gaussian corner noise.
+    """Return one frame's detections, with independent noise or with what a filter section takes ``sigma_px`` for.
 
     ``bias_px`` (11,) is how far a marker's corners are measured beside their place, as in ``Corners.by_bias``.
     """
     found: dict[int, list[LayerDetection]] = {}
     T_chaser_target = mission.camera.T_chaser_cam.matrix() @ T_cam_target
-    for expected in visible_layers(T_chaser_target, mission, CAMERA):
-        if np.ptp(expected.corners_px, axis=0).min() < SMALLEST_SIDE_PX or (only and expected.marker_id not in only):
-            continue
+    visible = [
+        expected
+        for expected in visible_layers(T_chaser_target, mission, CAMERA)
+        if np.ptp(expected.corners_px, axis=0).min() >= SMALLEST_SIDE_PX and (not only or expected.marker_id in only)
+    ]
+    exact = [SeenLayer(one.marker_id, one.layer, one.corners_px, sigma_px, np.zeros((4, 3))) for one in visible]
+    root = np.linalg.cholesky(corner_noise(exact, noise)) if exact else np.zeros((0, 0))
+    noise_px = (root @ rng.standard_normal(len(root))).reshape(-1, 4, 2)
+    for expected, new_px in zip(visible, noise_px, strict=True):
         bias = (bias_px or {}).get(expected.marker_id, np.zeros(BIAS_DOF))
         outward_px = bias[0] * outward_shift(expected.corners_px[None])[0]
         biased_px = expected.corners_px + outward_px + bias[1:3] + bias[3:].reshape(4, 2)
-        corners_px = biased_px + sigma_px * rng.standard_normal((4, 2))
-        found.setdefault(expected.marker_id, []).append(LayerDetection(expected.layer, corners_px, sigma_px))
+        layer = LayerDetection(expected.layer, biased_px + new_px, sigma_px)
+        found.setdefault(expected.marker_id, []).append(layer)
     return Detections(
         t_capture_ns=T0_NS + round(t_s * 1e9),
         camera=mission.camera.name,

@@ -7,7 +7,8 @@ from filterpy.kalman import KalmanFilter, rts_smoother
 
 from astratag.transforms import inverse
 from pipeline.convert import pose_matrix, pose_message, vector_message
-from pipeline.corner_filter import CornerFilter, Eye, SeenLayer, predicted_corners
+from pipeline.corner_filter import CornerFilter
+from pipeline.corners import Eye, SeenLayer, corner_noise, predicted_corners
 from pipeline.dynamics import STATES, Motion, process_noise
 from pipeline.mission import FilterSection
 from pipeline.pose_filter import corners_on_target
@@ -19,7 +20,8 @@ SIGMA_PX = 1e-3
 """So little noise that corners follow the pose linearly, to what is compared."""
 KNOWN = FilterSection(
     corner_floor_px=1e-4,
-    edge_bias_px=0.01,
+    edge_bias_px=0.0,
+    corner_bias_px=0.0,
     picture_shift_px=0.0,
     image_shift_px=0.01,
     acceleration_m_s2=1e-5,
@@ -28,8 +30,8 @@ KNOWN = FilterSection(
 MISSION = mission(filter=KNOWN)
 EYE = Eye(CAMERA, inverse(MISSION.camera.T_chaser_cam.matrix()))
 REAL = Motion.at_rest(truth(MISSION, approach(3).at(20.0)).T_a_b)
-SPREAD = np.diag(np.repeat([1e-5, 1e-5, 1e-4, 1e-4, 1e-2, 1e-4, 1e-2], [3, 3, 3, 3, 1, 1, 2]) ** 2)
-"""A covariance to start from, in the filter's order: m, rad, m/s, rad/s, px, share, px."""
+SPREAD = np.diag(np.repeat([1e-5, 1e-5, 1e-4, 1e-4, 1e-5, 1e-5, 1e-4, 1e-2], [3, 3, 3, 3, 3, 3, 1, 2]) ** 2)
+"""A covariance to start from, in the filter's order: m, rad, m/s, rad/s, m/s2, rad/s2, share, px."""
 
 SETTLED = 8
 """Frames from the start until a covariance can be inverted as it stands, which filterpy does."""
@@ -55,7 +57,7 @@ def test_an_update_is_filterpys():
     ours, theirs = FullFilter(prior, SPREAD, KNOWN), KalmanFilter(dim_x=STATES, dim_z=24)
     predicted = predicted_corners(prior, layers, EYE)
     assert predicted is not None
-    theirs.P, theirs.H, theirs.R = SPREAD.copy(), predicted[1], SIGMA_PX**2 * np.eye(24)
+    theirs.P, theirs.H, theirs.R = SPREAD.copy(), predicted[1], corner_noise(layers, KNOWN)
     measured = np.concatenate([layer.corners_px.ravel() for layer in layers])
     theirs.update((measured - predicted[0])[:, None])
     update = ours.update(layers, EYE)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from astratag.transforms import exp_so3, inverse, pose
 from benchmarks.filter import branches
-from pipeline.corner_filter import LASTING_LOOKS, Eye, SeenLayer, bending, predicted_corners
+from pipeline.corners import LASTING_LOOKS, Eye, SeenLayer, bending, predicted_corners
 from pipeline.dynamics import ATTITUDE, STATES, Motion
 from pipeline.hypotheses import aligned_misfit, mirrored_pose, tilt_of, tilted_pose
 from pipeline.mission import FlatSection
@@ -21,6 +21,7 @@ MISSION = mission(FlatSection(), side_m=0.5)
 EYE = Eye(CAMERA, inverse(MISSION.camera.T_chaser_cam.matrix()))
 T_MARKER_TARGET = inverse(MISSION.markers[0].T_target_marker.matrix())
 SIGMA_PX = 0.15
+ROOT = SIGMA_PX * np.eye(24)
 
 
 def facing(tilt_rad, range_m: float, place=(0.0, 0.0)) -> np.ndarray:
@@ -56,7 +57,7 @@ def test_a_place_found_with_one_tilt_does_not_speak_for_it():
     for shift_m in (0.0, 3e-3):
         believed = facing((0.1, 0.0), 15.0, (0.0, shift_m))
         one, other = (
-            aligned_misfit(tilted_pose(believed, sign * tilt_of(believed)) @ T_MARKER_TARGET, layers, EYE)
+            aligned_misfit(tilted_pose(believed, sign * tilt_of(believed)) @ T_MARKER_TARGET, layers, EYE, ROOT)
             for sign in (1, -1)
         )
         assert one == pytest.approx(other, abs=0.05)  # the line of sight itself turns by 0.2 mrad
@@ -66,8 +67,8 @@ def test_a_place_found_with_one_tilt_does_not_speak_for_it():
 def test_the_true_tilt_fits_exactly_and_its_reverse_does_not(tilt_rad):
     T = facing(tilt_rad, 5.0)
     layers = seen(T)
-    assert aligned_misfit(T @ T_MARKER_TARGET, layers, EYE) < 1e-9
-    assert aligned_misfit(mirrored_pose(T) @ T_MARKER_TARGET, layers, EYE) > 1.0
+    assert aligned_misfit(T @ T_MARKER_TARGET, layers, EYE, ROOT) < 1e-9
+    assert aligned_misfit(mirrored_pose(T) @ T_MARKER_TARGET, layers, EYE, ROOT) > 1.0
 
 
 def test_what_slopes_miss_is_the_second_order_of_what_corners_do():

@@ -32,7 +32,9 @@ def fly(mission: Mission, poses: list[np.ndarray], only: dict[int, set[int]] | N
     states, seen, limit = [], [], None
     for k, T_cam_target in enumerate(poses):
         limit = (only or {}).get(k, limit)
-        message = seen_from(T_cam_target, mission, sigma_px=SIGMA_PX, rng=rng, t_s=k / RATE_HZ, only=limit)
+        message = seen_from(
+            T_cam_target, mission, sigma_px=SIGMA_PX, rng=rng, t_s=k / RATE_HZ, only=limit, noise=mission.filter
+        )
         states.append(next(iter(pose_filter.step(message))))
         seen.append({found.marker_id for found in message.detections})
     return states, seen

@@ -11,7 +11,7 @@ from benchmarks.corridors.bound import CornerNoise, Frame, corner_residuals, mea
 from benchmarks.corridors.scenes import CAMERA as SCENE_CAMERA
 from benchmarks.corridors.scenes import RENDERED, Corridor, picture_at, scene_of
 from pipeline.convert import calibration_message, pose_matrix, pose_message, vector_message
-from pipeline.corner_filter import Eye, SeenLayer, predicted_corners
+from pipeline.corners import Eye, SeenLayer, predicted_corners
 from pipeline.detector import DetectorStep, decode_gray
 from pipeline.dynamics import Motion
 from pipeline.expected import is_false

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.bridge import NavigationBridge
-from pipeline.convert import NS_PER_S
+from pipeline.convert import NS_PER_S, vector_array
 from pipeline.dock import START_NS, DockSource, Loop, depart, fly_on_truth
 from pipeline.dock_report import Docking, judge
 from pipeline.dock_scenario import BlindSection, DockScenario, FaultSection, StartSection
@@ -40,11 +40,28 @@ def fly(scenario: DockScenario, distort: Distort = lambda axial_m, state: state)
         state = distort(axial_m, honest(truth))
         if state is not None:
             loop.bridge.take_state(state)
-        guidance = loop.act()
+        guidance, _ = loop.act()
         ticks.append((truth, guidance))
         axial_m = guidance.p_targetport_chaserport_m.z
         if loop.is_over(guidance):
             return ticks
+
+
+def test_the_chaser_tells_what_it_commands_and_measures():
+    """Not what is true: thrusters give some per cent more or less, gyroscope and star tracker have noise."""
+    loop = Loop(SHORT, START_NS, depart(SHORT, FakePlant))
+    chaser, pushed = SHORT.chaser, 0
+    for _ in range(60):
+        loop.bridge.take_state(honest(loop.look()))
+        flight, t_ns = loop.flight, loop.t_ns
+        guidance, told = loop.act()
+        assert told.t_capture_ns == t_ns
+        commanded = vector_array(guidance.force_chaser_n) / chaser.mass_kg
+        assert vector_array(told.acceleration_chaser_m_s2) == pytest.approx(commanded)
+        off = vector_array(told.omega_hill_chaser_in_chaser_rad_s) - flight.omega_hill_chaser_in_chaser_rad_s
+        assert 0 < np.abs(off).max() < 6 * chaser.rate_noise_rad_s
+        pushed += bool(commanded.any())
+    assert pushed
 
 
 def report(ticks: list[tuple[Truth, Guidance]], scenario: DockScenario = SHORT) -> Docking:

@@ -1,15 +1,19 @@
 """Monte Carlo: the filter's covariance is that of its errors (NEES, NIS), and its accuracy is at the bound."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 from astratag.transforms import difference, inverse, perturb
 from pipeline.convert import pose_matrix, vector_array
-from pipeline.corner_filter import CornerFilter, Eye, SeenLayer, predicted_corners
-from pipeline.dynamics import EDGE_BIAS, RATE, STATES, VELOCITY, Motion, process_noise
+from pipeline.corner_filter import CornerFilter
+from pipeline.corners import Eye, SeenLayer, corner_noise, predicted_corners
+from pipeline.dynamics import ACCELERATION, ANGULAR_ACCELERATION, RATE, STATES, VELOCITY, Motion, process_noise
 from pipeline.hypotheses import HypothesisBank
-from pipeline.mission import FlatSection
+from pipeline.lasting import PER_LAYER, covariance_px2, decay
+from pipeline.mission import FilterSection, FlatSection
 from pipeline.pose_filter import PoseFilter, corners_on_target
 from schemas import Mode, RelativeState
 from tests.approach import CALIBRATION, CAMERA, CYLINDER, approach, detection, detections, mission, truth
@@ -40,8 +44,28 @@ def band(dof: int, runs: int) -> tuple[float, float]:
     return chi2.ppf(tail, dof * runs) / (dof * runs), chi2.ppf(1 - tail, dof * runs) / (dof * runs)
 
 
+def pushed(noise: FilterSection, rng: np.random.Generator) -> np.ndarray:
+    """Return the error state (21,) of accelerations as they are at any time."""
+    error = np.zeros(STATES)
+    error[ACCELERATION] = noise.acceleration_m_s2 * rng.standard_normal(3)
+    error[ANGULAR_ACCELERATION] = noise.angular_acceleration_rad_s2 * rng.standard_normal(3)
+    return error
+
+
+def lasting_drawn(noise: FilterSection, rng: np.random.Generator) -> dict[int, np.ndarray]:
+    """Return lasting errors (9,) by layer as they are at any time."""
+    root = np.linalg.cholesky(covariance_px2(3, noise))
+    return dict(enumerate((root @ rng.standard_normal(len(root))).reshape(3, PER_LAYER)))
+
+
+def lasting_later(px: dict[int, np.ndarray], dt_s: float, noise: FilterSection, rng: np.random.Generator):
+    """Return lasting errors (9,) by layer ``dt_s`` later."""
+    left, fresh = decay(dt_s, noise), lasting_drawn(noise, rng)
+    return {layer: left * before + np.sqrt(1 - left**2) * fresh[layer] for layer, before in px.items()}
+
+
 def test_consistent_with_its_own_model():
-    """Motion, edge bias and corners drawn from what the filter assumes: NEES and NIS inside their 99.9 % bands."""
+    """Motion, lasting errors and corners drawn from what the filter assumes: NEES and NIS inside their 99.9 % bands."""
     runs, frames, sigma_px, dt_s = 40, 30, 0.1, 1 / HZ
     mission_ = mission()
     noise = mission_.filter
@@ -50,19 +74,20 @@ def test_consistent_with_its_own_model():
     for seed in range(runs):
         rng = np.random.default_rng(seed)
         T = truth(mission_, approach(seed, tilt_rad=(0.2, -0.3, 0.1)).at(12.0)).T_a_b
-        first = np.zeros(STATES)
+        first = pushed(noise, rng)
         first[VELOCITY] = noise.initial_speed_m_s * rng.standard_normal(3) / 20
         first[RATE] = noise.initial_rate_rad_s * rng.standard_normal(3) / 20
-        first[EDGE_BIAS] = noise.edge_bias_px * rng.standard_normal()
         real = Motion.at_rest(T).moved(first)
+        lasting_px = lasting_drawn(noise, rng)
         pose_filter = PoseFilter(mission_)
         pose_filter.step(CALIBRATION)
         for k in range(frames):
-            seen = detection(mission_, real.pose_chaser_target(), sigma_px=sigma_px, rng=rng, bias_px=real.edge_bias_px)
+            T = real.pose_chaser_target()
+            seen = detection(mission_, T, sigma_px=sigma_px, rng=rng, lasting_px=lasting_px)
             state = next(iter(pose_filter.step(detections(k * dt_s, seen))))
             if k > frames // 2 and state.nis_dof:
                 innovations.append((state.nis, state.nis_dof))
-            last = real
+            last, lasting_px = real, lasting_later(lasting_px, dt_s, noise, rng)
             real = real.after(dt_s, noise).moved(rng.multivariate_normal(np.zeros(STATES), Q))
         error = error_of(
             state, last.pose_chaser_target(), last.v_chaser_target_m_s, last.omega_chaser_target_in_target_rad_s
@@ -83,7 +108,7 @@ def test_consistent_on_slow_approaches(surface, sigma_px, bias_px):
 
     An edge bias that NIS would hardly show (0.05 px: 1 mm of range at 1.2 m) is estimated with the motion.
     """
-    mission_ = mission(surface)
+    mission_ = mission(surface, filter=FilterSection(edge_bias_px=0.03))
     found, of_pose = [], []
     for seed in range(2):
         rng, motion = np.random.default_rng(seed), approach(seed)
@@ -109,7 +134,7 @@ def test_accuracy_at_the_bound():
     """
     runs, frames, sigma_px, dt_s = 60, 30, 0.1, 1 / HZ
     mission_ = mission()
-    noise = mission_.filter
+    noise = mission_.filter.model_copy(update={"edge_bias_px": 0.0, "corner_bias_px": 0.0})
     eye = Eye(CAMERA, inverse(mission_.camera.T_chaser_cam.matrix()))
     points = [corners_on_target(mission_.markers[0], layer) for layer in (0, 1, 2)]
     T = truth(mission_, approach(0, tilt_rad=(0.2, -0.3, 0.1)).at(12.0)).T_a_b
@@ -117,13 +142,16 @@ def test_accuracy_at_the_bound():
 
     def layers_at(motion, rng=None):
         corners = predicted_corners(motion, [SeenLayer(0, 0, np.zeros((4, 2)), 1.0, p) for p in points], eye)[0]
-        noisy = corners
-        if rng is not None:
-            shift_px = noise.picture_shift_px * np.tile(rng.standard_normal(2), len(corners) // 2)
-            noisy = corners + shift_px + sigma_px * rng.standard_normal(corners.shape)
-        return [
+        exact = [
             SeenLayer(0, k, c.reshape(4, 2), sigma_px, p)
-            for k, (c, p) in enumerate(zip(noisy.reshape(3, 8), points, strict=True))
+            for k, (c, p) in enumerate(zip(corners.reshape(3, 8), points, strict=True))
+        ]
+        if rng is None:
+            return exact
+        off_px = np.linalg.cholesky(corner_noise(exact, noise)) @ rng.standard_normal(len(corners))
+        return [
+            replace(layer, corners_px=layer.corners_px + off)
+            for layer, off in zip(exact, off_px.reshape(3, 4, 2), strict=True)
         ]
 
     bound = CornerFilter.start(T, 1.0, noise)
@@ -137,9 +165,7 @@ def test_accuracy_at_the_bound():
     Q = process_noise(dt_s, noise)
     for seed in range(runs):
         rng = np.random.default_rng(seed)
-        first = np.zeros(STATES)
-        first[EDGE_BIAS] = noise.edge_bias_px * rng.standard_normal()
-        real = rest.moved(first)
+        real = rest.moved(pushed(noise, rng))
         bank = HypothesisBank.start([T], layers_at(real, rng), eye, noise)
         for _ in range(frames - 1):
             real = real.after(dt_s, noise).moved(rng.multivariate_normal(np.zeros(STATES), Q))
@@ -160,9 +186,9 @@ def test_covariance_is_in_the_messages_convention():
         pose_filter = PoseFilter(mission_)
         pose_filter.step(CALIBRATION)
         rng = np.random.default_rng(seed)
-        bias_px = mission_.filter.edge_bias_px * rng.standard_normal()
+        lasting_px = lasting_drawn(mission_.filter, rng)
         for k in range(4):  # so close in time that nothing moves, and that the first look counts little
-            seen = detection(mission_, T, sigma_px=0.1, rng=rng, bias_px=bias_px)
+            seen = detection(mission_, T, sigma_px=0.1, rng=rng, lasting_px=lasting_px)
             state = next(iter(pose_filter.step(detections(k * 1e-6, seen))))
         errors.append(difference(T, pose_matrix(state.T_chaser_target)))
     scatter = np.cov(np.array(errors).T)

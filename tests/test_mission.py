@@ -103,6 +103,8 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
 UNITLESS = {
     "gate_probability",
     "ambiguity_ratio",
+    "edge_bias_shared",
+    "edge_end_correlation",
     "rotation_wxyz",
     "R_hill_chaser_wxyz",
     "scale_sigma",

@@ -14,7 +14,7 @@ from astratag.transforms import difference, exp_so3, inverse, pose, transform
 from nodes.bus import Received
 from nodes.step_host import StepWork
 from pipeline.convert import pose_matrix, pose_message, vector_array
-from pipeline.corner_filter import Eye, SeenLayer, outward_shift, predicted_corners
+from pipeline.corners import Eye, SeenLayer, outward_shift, predicted_corners
 from pipeline.dynamics import STATES, Motion
 from pipeline.hypotheses import mirrored_pose
 from pipeline.mission import FilterSection, FlatSection, Mission

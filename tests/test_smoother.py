@@ -5,7 +5,7 @@ import numpy as np
 from astratag.transforms import difference, inverse
 from pipeline.bound import posterior_bounds
 from pipeline.convert import points_array, pose_matrix
-from pipeline.corner_filter import Eye, SeenLayer
+from pipeline.corners import Eye, SeenLayer
 from pipeline.dynamics import Motion
 from pipeline.pose_filter import PoseFilter, corners_on_target
 from pipeline.smoother import smooth

@@ -17,7 +17,18 @@ from numpy.typing import NDArray
 from astratag.camera import Camera
 from astratag.transforms import inverse, skew, transform
 from pipeline.convert import points_array, pose_matrix, vector_array
-from pipeline.dynamics import ATTITUDE, MOTION, POSITION, RATE, VELOCITY, Motion, process_noise
+from pipeline.dynamics import (
+    ACCELERATION,
+    ANGULAR_ACCELERATION,
+    ATTITUDE,
+    ESTIMATED,
+    MOTION,
+    POSITION,
+    RATE,
+    VELOCITY,
+    Motion,
+    process_noise,
+)
 from pipeline.mission import Mission
 from pipeline.pose_filter import corners_on_target
 from schemas import Detections, Truth
@@ -25,7 +36,7 @@ from schemas import Detections, Truth
 Array = NDArray[np.float64]
 Key = tuple[int, int, int]
 """Marker, layer, and the bin of range."""
-STATES = 12
+STATES = ESTIMATED.stop
 GROSS_PX = 0.5
 """RMS of a layer's corners beyond which they are not noise: ten times what the detector promises at its worst."""
 LEAST_SAMPLES = 5
@@ -125,13 +136,15 @@ def posterior_bound(
     prior = np.empty(STATES)
     prior[POSITION], prior[ATTITUDE] = IGNORANT_M, IGNORANT_RAD
     prior[VELOCITY], prior[RATE] = settings.initial_speed_m_s, settings.initial_rate_rad_s
+    prior[ACCELERATION] = settings.acceleration_m_s2
+    prior[ANGULAR_ACCELERATION] = settings.angular_acceleration_rad_s2
     P, bounds, before_s = np.diag(prior**2), [], None
     for frame in frames:
         motion = _true_motion(frame.truth)
         if before_s is not None:
             dt_s = frame.t_s - before_s
-            F = motion.transition(dt_s, settings)[MOTION, MOTION]
-            P = F @ P @ F.T + process_noise(dt_s, settings)[MOTION, MOTION]
+            F = motion.transition(dt_s, settings)[ESTIMATED, ESTIMATED]
+            P = F @ P @ F.T + process_noise(dt_s, settings)[ESTIMATED, ESTIMATED]
         information = np.linalg.inv(P)
         for seen in measured_layers(frame, mission, camera):
             if seen.is_gross:
@@ -141,7 +154,7 @@ def posterior_bound(
             information = information + H.T @ H / variance
         P = np.linalg.inv(information)
         P = (P + P.T) / 2
-        bounds.append(P)
+        bounds.append(P[MOTION, MOTION])
         before_s = frame.t_s
     return np.array(bounds)
 
@@ -157,7 +170,7 @@ def _true_motion(truth: Truth) -> Motion:
 
 
 def _corner_jacobian(motion: Motion, points_target: Array, mission: Mission, camera: Camera) -> Array:
-    """Return how corners (4, 3) on the target move in the image with the state, (8, 12)."""
+    """Return how corners (4, 3) on the target move in the image with the state, (8, 18)."""
     T_cam_chaser = inverse(mission.camera.T_chaser_cam.matrix())
     R_cam_chaser = T_cam_chaser[:3, :3]
     points_cam = transform(T_cam_chaser @ motion.pose_chaser_target(), points_target)

@@ -23,7 +23,7 @@ TILTS_RAD = (0.0, float(np.deg2rad(25)))
 HARDER_TILTS_RAD = (0.0, float(np.deg2rad(12)))
 """So nearly frontal that which way a print is tilted can hardly be seen."""
 GATE = float(chi2.ppf(0.999, df=3))
-NOISE = FilterSection(angular_acceleration_rad_s2=0.002, picture_shift_px=0.0)
+NOISE = FilterSection(angular_acceleration_rad_s2=0.001, picture_shift_px=0.0)
 
 
 @dataclass

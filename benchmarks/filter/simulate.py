@@ -6,16 +6,27 @@ That is what a bound is about: the mission's filter section describes the very d
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from astratag.transforms import difference, exp_so3, inverse, pose, skew
-from pipeline.bound import posterior_bounds
-from pipeline.convert import points_message, pose_matrix, pose_message, vector_array
-from pipeline.corner_filter import Eye, SeenLayer, outward_shift
-from pipeline.dynamics import POSITION, SPEEDS, STATES, Motion, process_noise
+from pipeline.bound import Bound
+from pipeline.convert import points_array, points_message, pose_matrix, pose_message, vector_array
+from pipeline.corners import Eye, SeenLayer, outward_shift, predicted_corners
+from pipeline.dynamics import (
+    ACCELERATION,
+    MOTION,
+    POSITION,
+    SPEEDS,
+    STATES,
+    VELOCITY,
+    Motion,
+    lasting_push,
+    process_noise,
+)
 from pipeline.mission import FilterSection, FlatSection, Mission
 from pipeline.pose_filter import PoseFilter, corners_on_target
 from pipeline.scenario import FACING
@@ -25,8 +36,16 @@ from tests.approach import CALIBRATION, CAMERA, MARKER, detections, mission, vis
 Array = NDArray[np.float64]
 SIGMA_PX = 0.15
 SETTLED_S = 2.0
-MATCHED = FilterSection(edge_bias_px=0.0, scale_sigma=0.0, picture_shift_px=0.0)
-"""A camera without fault."""
+MATCHED = FilterSection(
+    edge_bias_px=0.0,
+    corner_bias_px=0.0,
+    lasting_sigma_px=0.0,
+    edge_end_correlation=0.0,
+    scale_sigma=0.0,
+    picture_shift_px=0.0,
+    correlation_s=0.1,
+)
+"""A camera without fault, corners each with noise of its own, accelerations that are new with every other picture."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +86,10 @@ class Samples:
     """Squared errors of the marker's pose in the camera: lateral (m2), axial (m2), tilt (rad2)."""
     bounds: list[Array] = field(default_factory=list)
     """The same of the bound."""
+    variances: list[Array] = field(default_factory=list)
+    """The same of the filter's own covariance."""
+    ideal: list[Array] = field(default_factory=list)
+    """Squared errors of the linear filter that reaches the bound, from the same draws."""
     nees: list[float] = field(default_factory=list)
     nis: list[tuple[float, int]] = field(default_factory=list)
     cpu_s: list[float] = field(default_factory=list)
@@ -89,7 +112,8 @@ def motions(case: Case, mission_: Mission, rng: np.random.Generator) -> list[Mot
         for range_m in (case.ranges_m[0], case.ranges_m[-1])
     )
     to_go_s = dt_s * np.arange(count - 1, -1, -1)
-    drifted = shoves[:, POSITION].sum(axis=0) + to_go_s @ shoves[:, SPEEDS[:3]]
+    pushed_s2 = np.array([lasting_push(float(left_s), case.noise.correlation_s)[2] for left_s in to_go_s])
+    drifted = shoves[:, POSITION].sum(axis=0) + to_go_s @ shoves[:, SPEEDS[:3]] + pushed_s2 @ shoves[:, ACCELERATION]
     v = (last[:3, 3] - first[:3, 3] - drifted) / (dt_s * count)  # where the noise leads is where the marker is
     real = Motion(first[:3, 3], first[:3, :3], v, np.zeros(3))
     path = []
@@ -139,11 +163,11 @@ def _run(case: Case, mission_: Mission, seed: int, samples: Samples) -> None:
     rng = np.random.default_rng(seed)
     offsets_px, path = rng.standard_normal((3, 4, 2)), motions(case, mission_, rng)
     seen = [look(case, mission_, motion, rng, offsets_px) for motion in path]
-    bounds = _bounds(case, mission_, path, seen) if case.limits else [np.eye(12)] * len(path)
+    ideal = list(_ideal(case, mission_, path, seen)) if case.limits else [(np.eye(12), np.zeros(12))] * len(path)
     pose_filter = PoseFilter(mission_)
     pose_filter.step(CALIBRATION)
     before: Array | None = None
-    for k, (motion, found, bound) in enumerate(zip(path, seen, bounds, strict=True)):
+    for k, (motion, found, (bound, reached)) in enumerate(zip(path, seen, ideal, strict=True)):
         message = detections(k / case.rate_hz, found)
         started_s = time.process_time()
         state = next(iter(pose_filter.step(message)))
@@ -154,7 +178,7 @@ def _run(case: Case, mission_: Mission, seed: int, samples: Samples) -> None:
             samples.run.append(seed)
             samples.frame.append(k)
             samples.cpu_s.append(cpu_s)
-            _keep(samples, mission_, motion, state, bound)
+            _keep(samples, mission_, motion, state, bound, reached)
             if innovation is not None and before is not None and len(before) == len(innovation):
                 samples.correlation.append(
                     (float(before @ innovation), float(innovation @ innovation), len(innovation))
@@ -162,24 +186,46 @@ def _run(case: Case, mission_: Mission, seed: int, samples: Samples) -> None:
         before = innovation
 
 
-def _bounds(case: Case, mission_: Mission, path: list[Motion], seen: list[Detection | None]) -> list[Array]:
-    eye = Eye(CAMERA, inverse(mission_.camera.T_chaser_cam.matrix()))
-    nothing = np.zeros((4, 2))
-    looks = (
-        (
-            round(k * 1e9 / case.rate_hz),
-            motion,
-            [
-                SeenLayer(MARKER, layer.layer, nothing, SIGMA_PX, corners_on_target(mission_.markers[0], layer.layer))
-                for layer in (found.layers if found is not None else [])
-            ],
-        )
-        for k, (motion, found) in enumerate(zip(path, seen, strict=True))
-    )
-    return list(posterior_bounds(looks, eye, case.noise))
+def _ideal(
+    case: Case, mission_: Mission, path: list[Motion], seen: list[Detection | None]
+) -> Iterator[tuple[Array, Array]]:
+    """Yield the bound (12, 12) at each frame, and the error (12,) of the linear filter that reaches it.
+
+    That filter takes its slopes at the truth, and meets the same disturbances and the same corner noise.
+    """
+    eye, dt_s = Eye(CAMERA, inverse(mission_.camera.T_chaser_cam.matrix())), 1 / case.rate_hz
+    bound = Bound.start(path[0].pose_chaser_target(), case.ranges_m[0], case.noise)
+    error = np.zeros(STATES)
+    error[VELOCITY] = path[0].v_chaser_target_m_s  # filters begin at rest
+    for k, (motion, found) in enumerate(zip(path, seen, strict=True)):
+        if k:
+            error = path[k - 1].transition(dt_s, case.noise) @ error
+            error += path[k - 1].after(dt_s, case.noise).error_of(motion)
+            bound.predict(dt_s)
+        layers = [
+            SeenLayer(
+                MARKER,
+                layer.layer,
+                points_array(layer.corners_px),
+                SIGMA_PX,
+                corners_on_target(mission_.markers[0], layer.layer),
+            )
+            for layer in (found.layers if found is not None else [])
+        ]
+        bound.look(motion, layers, eye)
+        exact = predicted_corners(motion, layers, eye) if layers else None
+        if bound.gain is not None and exact is not None:
+            K, H = bound.gain
+            off_px = np.concatenate([layer.corners_px.ravel() for layer in layers]) - exact[0]
+            error = error - K @ (H @ error + off_px)
+        told = error[MOTION].copy()
+        told[POSITION] = motion.R_chaser_target.T @ told[POSITION]
+        yield bound.message_covariance(), told
 
 
-def _keep(samples: Samples, mission_: Mission, real: Motion, state: RelativeState, bound: Array) -> None:
+def _keep(
+    samples: Samples, mission_: Mission, real: Motion, state: RelativeState, bound: Array, reached: Array
+) -> None:
     assert state.T_chaser_target is not None and state.covariance is not None
     assert state.v_chaser_target_m_s is not None and state.omega_chaser_target_in_target_rad_s is not None
     T_cam_chaser = inverse(mission_.camera.T_chaser_cam.matrix())
@@ -196,10 +242,12 @@ def _keep(samples: Samples, mission_: Mission, real: Motion, state: RelativeStat
     samples.nees.append(float(whole @ np.linalg.solve(P, whole)))
     samples.nis.append((state.nis or 0.0, state.nis_dof))
     J = camera_from_target(T_cam_chaser @ T, T_target_marker)
-    error, limit = J @ whole[:6], np.diag(J @ bound[:6, :6] @ J.T)
+    error, limit, own = J @ whole[:6], np.diag(J @ bound[:6, :6] @ J.T), np.diag(J @ P[:6, :6] @ J.T)
     samples.range_m.append(float((T_cam_chaser @ T @ T_target_marker)[2, 3]))
     samples.squares.append(_by_axis(error**2))
     samples.bounds.append(_by_axis(limit))
+    samples.variances.append(_by_axis(own))
+    samples.ideal.append(_by_axis((J @ reached[:6]) ** 2))
 
 
 def _by_axis(squares: Array) -> Array:

@@ -17,7 +17,7 @@ from astratag.detection import LayerDetection
 from astratag.geometry import layer_corners_print
 from astratag.pose import planar_poses
 from pipeline.convert import points_array
-from pipeline.corner_filter import outward_shift
+from pipeline.corners import outward_shift
 from pipeline.mission import MarkerSection
 from schemas import Detections
 
