@@ -64,7 +64,7 @@ REACH, LAYER_REACH = 0.07, 0.13
 SPACING_PX = 0.8
 MOST_LINES, FEWEST_LINES = 32, 12
 """Grid lines across the print: so many that they are ``SPACING_PX`` apart where it looks widest, within bounds."""
-SIGMA_FLOOR_PX = 0.02
+SIGMA_FLOOR_PX = 0.012
 """What a point's standard deviation never falls below: print, lens model, shape of the blur."""
 FINELY_SAMPLED_PX, COARSENESS = 64.0, 1.5
 """Prints that look larger are sampled so coarsely that this grows, by this power of their size."""
