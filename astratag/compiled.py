@@ -42,8 +42,6 @@ LIGHT, GRAY = array(SINGLE, 2), array(types.uint8, 2)
 """Images (H, W)."""
 BRIGHTNESS = (LIGHT, GRAY)
 """Either image."""
-CHANNELS = array(SINGLE, 3)
-"""Images of several channels (H, W, C)."""
 VECTOR, MATRIX, CUBE = array(REAL, 1), array(REAL, 2), array(REAL, 3)
 FLAGS, FLAG_MATRIX = array(BOOL, 1), array(BOOL, 2)
 INDICES = array(INT, 1)

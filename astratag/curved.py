@@ -15,7 +15,7 @@ from astratag.candidates import FRAME, LEAST_FRAMED, OUTER, Candidate, darker_in
 from astratag.codes import Reading
 from astratag.codes.acceptance import chance_of_correlation
 from astratag.codes.soft import correlations, hamming
-from astratag.compiled import INDICES, MATRIX, REAL, VECTOR, compiled
+from astratag.compiled import INDICES, MATRIX, REAL, compiled
 from astratag.cylinder import Bent, CylinderWarp, bent_through
 from astratag.detection import LayerDetection
 from astratag.fit import fit_edges
@@ -27,7 +27,7 @@ from astratag.geometry import (
 )
 from astratag.grow import ALL_EDGES, Fit, layer_side_px, settle
 from astratag.neighbours import Crossings
-from astratag.polygons import simplified
+from astratag.polygons import simplified, turn
 from astratag.sampling import AS_GRAY, Light
 from astratag.search import Outlines
 from astratag.signature import SAMPLES, Artwork, Codebook, Warp, cell_values, layer_cells, sample, unit
@@ -106,12 +106,6 @@ def near_sides(outlines: Outlines) -> Array:
     return outlines.in_image(sides[longest] + outset)
 
 
-@compiled(VECTOR, VECTOR)
-def _turn(before: Array, after: Array) -> float:
-    """Return by how many radians one vector (2,) is turned clockwise in the image from another."""
-    return math.atan2(before[0] * after[1] - before[1] * after[0], before[0] * after[0] + before[1] * after[1])
-
-
 @compiled(MATRIX, INDICES, REAL, REAL, REAL)
 def _near_sides(
     points: Array, starts: NDArray[np.int64], tolerance: float, least_near: float, least_beside: float
@@ -141,7 +135,7 @@ def _near_sides(
             beside = math.hypot(before[0], before[1]), math.hypot(after[0], after[1])
             if length < least_near or min(beside) < least_beside:
                 continue
-            turns = _turn(before, side), _turn(side, after)
+            turns = turn(before, side), turn(side, after)
             alike = -(before[0] * after[0] + before[1] * after[1]) / (beside[0] * beside[1])
             if min(turns) > LEAST_TURN_RAD and max(turns) < np.pi - LEAST_TURN_RAD and alike > LEAST_ALIKE:
                 sides[found, 0], sides[found, 1], lengths[found] = first, second, length
@@ -157,8 +151,7 @@ def curved_candidates(gray: Image, bent: Bent, codebook: Codebook, artwork: Artw
         return []
     facing = bent.facing(_CELL_MIDDLES, at)
     glance = _with_middle(sample(gray, bent.project(_CELL_MIDDLES, at)), facing)
-    codes = codebook.dictionary.oriented.reshape(-1, CELLS).astype(float)
-    likeliest = np.argsort(-(unit(glance) @ unit(codes).T).max(axis=1), kind="stable")[:MAX_READ]
+    likeliest = np.argsort(-(unit(glance) @ codebook.unit_codes[0].T).max(axis=1), kind="stable")[:MAX_READ]
     at, facing = at[likeliest], facing[likeliest]
     readings = codebook.read(_with_middle(cell_values(gray, bent.project(SAMPLES, at)), facing))
     found: list[Candidate] = []

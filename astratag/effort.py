@@ -13,8 +13,6 @@ Array = NDArray[np.float64]
 
 SAME_SQUARE = 0.04
 """Squares whose centres and sides differ by less than this fraction are one square found twice."""
-
-
 BETTER = 0.03
 """A square that was looked at is looked at again where it reads so much better."""
 LEAST_UNITS, UNITS_A_PIXEL, MOST_UNITS = 12_000, 0.065, 34_000

@@ -1,4 +1,4 @@
-"""Polygons: how large many contours are, and which of them simplify to convex quads.
+"""Polygons: which of many contours simplify to convex quads, straight or with bulging sides.
 
 Compiled, because an image has hundreds of contours, and each is simplified at several tolerances.
 """
@@ -249,14 +249,19 @@ def clockwise(quads: Array, least_side: float, outset: float) -> Array:
     return kept[:count].copy()
 
 
+@compiled(VECTOR, VECTOR)
+def turn(before: Array, after: Array) -> float:
+    """Return by how many radians one vector (2,) is turned clockwise in the image from another."""
+    return math.atan2(before[0] * after[1] - before[1] * after[0], before[0] * after[0] + before[1] * after[1])
+
+
 @compiled(MATRIX)
 def _turns(polygon: Array) -> Array:
     """Return by how many radians a polygon (N, 2) turns clockwise in the image at each point (N,)."""
     count = len(polygon)
     turns = np.empty(count)
     for i in range(count):
-        before, after = polygon[i] - polygon[i - 1], polygon[(i + 1) % count] - polygon[i]
-        turns[i] = math.atan2(before[0] * after[1] - before[1] * after[0], before[0] * after[0] + before[1] * after[1])
+        turns[i] = turn(polygon[i] - polygon[i - 1], polygon[(i + 1) % count] - polygon[i])
     return turns
 
 

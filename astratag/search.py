@@ -280,11 +280,6 @@ def _cross(a: Array, b: Array) -> Array:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-def _squared(a: Array) -> Array:
-    """Return the squared lengths (...) of vectors (..., 2)."""
-    return a[..., 0] * a[..., 0] + a[..., 1] * a[..., 1]
-
-
 def _tolerances(whole: bool) -> Array:
     return np.array(POLYGON_TOLERANCES[: WHOLE_TOLERANCES if whole else None])
 
