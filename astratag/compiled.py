@@ -44,12 +44,14 @@ BRIGHTNESS = (LIGHT, GRAY)
 """Either image."""
 VECTOR, MATRIX, CUBE = array(REAL, 1), array(REAL, 2), array(REAL, 3)
 FLAGS, FLAG_MATRIX = array(BOOL, 1), array(BOOL, 2)
-INDICES = array(INT, 1)
+INDICES, INDEX_MATRIX = array(INT, 1), array(INT, 2)
 BITS = array(types.uint8, 2)
 TABLE = array(types.int32, 2)
 """All in C order, and only read."""
 INTO_SHAPES, INTO_POINTS = types.Array(types.uint8, 2, "C"), types.Array(REAL, 2, "C")
 """Shapes (H, W) and points (N, 2) that are written to as well."""
+INTO_MARKS, WORDS = types.Array(types.uint8, 1, "C"), types.Array(types.uint64, 1, "C")
+"""Shapes row by row (H W,), a pixel at once and eight."""
 PLACES = (MATRIX, array(SINGLE, 2))
 """Points (N, 2), exact or to what a pixel needs."""
 PLACES_OF_MANY = (CUBE, array(SINGLE, 3))

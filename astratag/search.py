@@ -187,7 +187,7 @@ def find_outlines(gray: Image, how: Binarisation = PLAIN, image: Scaled | None =
     shapes, changes = threshold_blocks(smooth, sums, worth, block_px, how.window_px, how.offset, how.holes)
     contours, followed = NO_CONTOURS, 0
     if how.scale * changes <= NOISE * image.looked_at_px:  # else thousands of contours, and none of them a square
-        points, starts, areas, perimeters, followed = traced(shapes, MIN_PERIMETER_PX)
+        points, starts, areas, perimeters, followed = traced(shapes, worth, block_px, MIN_PERIMETER_PX)
         contours = Contours(points, starts, areas, perimeters)
     if how.holes:
         contours = contours.run_backwards()
