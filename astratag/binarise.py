@@ -23,6 +23,7 @@ from astratag.compiled import (
     INTO_MARKS,
     INTO_POINTS,
     INTO_SHAPES,
+    MATRIX,
     REAL,
     TABLE,
     WORDS,
@@ -97,10 +98,7 @@ class Contours:
 
     def chosen(self, which: Indices) -> Contours:
         """Return some of them, in that order."""
-        lengths = np.diff(self.starts)[which]
-        starts = np.append(0, np.cumsum(lengths))
-        at = np.arange(starts[-1]) + np.repeat(self.starts[which] - starts[:-1], lengths)
-        return Contours(self.points[at], starts, self.areas[which], self.perimeters[which])
+        return Contours(*_chosen(self.points, self.starts, which), self.areas[which], self.perimeters[which])
 
     def run_backwards(self) -> Contours:
         """Return all run the other way around: of shapes of paper, the holes are shapes."""
@@ -110,6 +108,20 @@ class Contours:
             -self.areas[::-1],
             np.ascontiguousarray(self.perimeters[::-1]),
         )
+
+
+@compiled(MATRIX, INDICES, INDICES)
+def _chosen(points: Array, starts: Indices, which: Indices) -> tuple[Array, Indices]:
+    """Return points and starts of some of ``Contours``, in that order."""
+    places = np.zeros(len(which) + 1, dtype=np.int64)
+    for i in range(len(which)):
+        places[i + 1] = places[i] + starts[which[i] + 1] - starts[which[i]]
+    kept = np.empty((places[-1], 2))
+    for i in range(len(which)):
+        first = starts[which[i]] - places[i]
+        for k in range(places[i], places[i + 1]):
+            kept[k, 0], kept[k, 1] = points[first + k, 0], points[first + k, 1]
+    return kept, places
 
 
 NO_CONTOURS = Contours(np.zeros((0, 2)), np.zeros(1, dtype=np.int64), np.zeros(0), np.zeros(0))

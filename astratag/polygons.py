@@ -80,6 +80,59 @@ def _cleaned(polygon: Array, count: int, squared: float) -> Array:
     return kept[:left].copy()
 
 
+@compiled(MATRIX)
+def _far_apart(contour: Array) -> tuple[int, int, float]:
+    """Return two points of a contour (N, 2) that are far apart, and how far, squared: where its polygon begins."""
+    start, farthest, squared = 0, 0, 0.0
+    for _ in range(FARTHEST_ROUNDS):
+        start, squared = farthest, 0.0
+        x, y = contour[start]
+        for half in range(2):  # from the start on around it: of points as far the first counts
+            for k in range(start + 1, len(contour)) if half == 0 else range(start):
+                apart = (contour[k, 0] - x) ** 2 + (contour[k, 1] - y) ** 2
+                if apart > squared:
+                    squared, farthest = apart, k
+    return start, farthest, squared
+
+
+@compiled(MATRIX, INT, INT)
+def _farthest_off(contour: Array, begin: int, end: int) -> tuple[float, int]:
+    """Return how far a contour (N, 2) leads off the line between two of its points, times their distance, and where."""
+    x, y = contour[begin]
+    dx, dy = contour[end, 0] - x, contour[end, 1] - y
+    off, at = 0.0, begin
+    stop = end if end > begin else len(contour)
+    for half in range(2):
+        for k in range(begin + 1, stop) if half == 0 else range(0 if end <= begin else end, end):
+            distance = abs((contour[k, 1] - y) * dx - (contour[k, 0] - x) * dy)
+            if distance > off:
+                off, at = distance, k
+    return off, at
+
+
+@compiled(MATRIX, INT, INT, REAL, INT)
+def _simplified(contour: Array, start: int, other: int, tolerance: float, most: int) -> Array:
+    """Return ``simplified`` of a contour (N, 2) of which two points that are kept are known."""
+    polygon, stack = np.empty((most + 1, 2)), np.empty((len(contour) + 2, 2), dtype=np.int64)
+    stack[0, 0], stack[0, 1], stack[1, 0], stack[1, 1] = other, start, start, other
+    top, size = 2, 0
+    while top > 0:
+        top -= 1
+        begin, end = stack[top]
+        x, y = contour[begin]
+        dx, dy = contour[end, 0] - x, contour[end, 1] - y
+        off, at = _farthest_off(contour, begin, end)
+        if off * off <= tolerance * tolerance * (dx * dx + dy * dy):
+            polygon[size, 0], polygon[size, 1] = x, y
+            size += 1
+            if size > most:
+                return polygon
+        else:
+            stack[top, 0], stack[top, 1], stack[top + 1, 0], stack[top + 1, 1] = at, end, begin, at
+            top += 2
+    return _cleaned(polygon, size, tolerance * tolerance)
+
+
 @compiled(MATRIX, REAL, INT)
 def simplified(contour: Array, tolerance: float, most: int) -> Array:
     """Return the polygon (M, 2) that a closed contour (N, 2) stays within a tolerance of.
@@ -89,43 +142,10 @@ def simplified(contour: Array, tolerance: float, most: int) -> Array:
     Ramer, "An iterative procedure for the polygonal approximation of plane curves", 1972; Douglas and Peucker, 1973.
     Begun, ordered and cleaned of points on nearly straight lines as OpenCV's ``approxPolyDP`` does.
     """
-    count, squared = len(contour), tolerance * tolerance
-    polygon = np.empty((count, 2))
-    start, ahead, farthest = 0, 0, 0.0
-    for _ in range(FARTHEST_ROUNDS):
-        start, farthest = (start + ahead) % count, 0.0
-        for j in range(1, count):
-            k = (start + j) % count
-            apart = (contour[k, 0] - contour[start, 0]) ** 2 + (contour[k, 1] - contour[start, 1]) ** 2
-            if apart > farthest:
-                farthest, ahead = apart, j
-    if farthest <= squared:
+    start, other, squared = _far_apart(contour)
+    if squared <= tolerance * tolerance:
         return contour[start : start + 1].copy()
-    other = (start + ahead) % count
-    stack = np.empty((count + 2, 2), dtype=np.int64)
-    stack[0, 0], stack[0, 1], stack[1, 0], stack[1, 1] = other, start, start, other
-    top, size = 2, 0
-    while top > 0:
-        top -= 1
-        begin, end = stack[top]
-        x, y = contour[begin]
-        dx, dy = contour[end, 0] - x, contour[end, 1] - y
-        off, at = 0.0, begin
-        k = (begin + 1) % count
-        while k != end:
-            distance = abs((contour[k, 1] - y) * dx - (contour[k, 0] - x) * dy)
-            if distance > off:
-                off, at = distance, k
-            k = (k + 1) % count
-        if off * off <= squared * (dx * dx + dy * dy):
-            polygon[size, 0], polygon[size, 1] = x, y
-            size += 1
-            if size > most:
-                return polygon[:size].copy()
-        else:
-            stack[top, 0], stack[top, 1], stack[top + 1, 0], stack[top + 1, 1] = at, end, begin, at
-            top += 2
-    return _cleaned(polygon, size, squared)
+    return _simplified(contour, start, other, tolerance, most)
 
 
 @compiled(MATRIX)
@@ -173,10 +193,11 @@ def _length(polygon: Array) -> float:
 def _convex_quad(contour: Array, perimeter: float, tolerances: Array, whole: bool) -> Array:
     """Return the convex quad (4, 2) that a contour (N, 2) simplifies to, else an empty one (0, 2); see below."""
     best, finest, too_fine, too_coarse = np.empty((0, 2)), np.inf, 0.0, np.inf
+    start, other, _ = _far_apart(contour)
     for tolerance in tolerances:
         if not too_fine < tolerance < too_coarse:
             continue
-        polygon = simplified(contour, tolerance * perimeter, MOST_POINTS)
+        polygon = _simplified(contour, start, other, tolerance * perimeter, MOST_POINTS)
         if len(polygon) > MOST_POINTS:
             too_fine = tolerance
         elif len(polygon) < 4:
@@ -212,6 +233,75 @@ def convex_quads(
             around = hull(contour)
             if 4 <= len(around) < len(contour):
                 quad = _convex_quad(around, _length(around), tolerances, whole)
+        if len(quad) > 0:
+            found[i], quads[i] = True, quad
+    return found, quads
+
+
+@compiled(MATRIX, REAL, INT, INT, INT, REAL)
+def _uncut(contour: Array, tolerance: float, most_vertices: int, width: int, height: int, border: float) -> Array:
+    """Return the convex quad (4, 2) that an image's border cut corners off, else an empty one (0, 2); see below."""
+    polygon, none = simplified(hull(contour), tolerance, most_vertices), np.empty((0, 2))
+    count, sides = len(polygon), 0
+    if not 4 < count <= most_vertices:
+        return none
+    starts, along = np.empty((4, 2)), np.empty((4, 2))
+    for i in range(count):
+        j = (i + 1) % count
+        if (
+            max(polygon[i, 0], polygon[j, 0]) <= border
+            or max(polygon[i, 1], polygon[j, 1]) <= border
+            or min(polygon[i, 0], polygon[j, 0]) >= width - 1 - border
+            or min(polygon[i, 1], polygon[j, 1]) >= height - 1 - border
+        ):
+            continue
+        if sides == 4:
+            return none
+        starts[sides], along[sides] = polygon[i], polygon[j] - polygon[i]
+        sides += 1
+    if sides < 4:
+        return none
+    quad, left = np.empty((4, 2)), 0
+    for i in range(4):
+        before = (i + 3) % 4
+        (ux, uy), (vx, vy), (dx, dy) = along[before], along[i], starts[i] - starts[before]
+        turned = ux * vy - uy * vx
+        if turned == 0:
+            return none
+        left += turned > 0
+        quad[i] = starts[before] + along[before] * ((dx * vy - dy * vx) / turned)
+    return quad if left == 0 or left == 4 else none
+
+
+@compiled(MATRIX, INDICES, VECTOR, INT, INT, REAL, REAL, INT, INT)
+def uncut_quads(
+    points: Array,
+    starts: NDArray[np.int64],
+    perimeters: Array,
+    width: int,
+    height: int,
+    border: float,
+    tolerance: float,
+    most_vertices: int,
+    most: int,
+) -> tuple[NDArray[np.bool_], Array]:
+    """Return which contours are convex quads that an image's border cut corners off (N,), and these whole (N, 4, 2).
+
+    Contours are given as to ``convex_quads``, in an image of ``width`` and ``height``.  Those within ``border`` of its
+    border are cut; the first ``most`` of them are looked at.
+    """
+    count = len(perimeters)
+    found, quads, cut = np.zeros(count, dtype=np.bool_), np.zeros((count, 4, 2)), 0
+    for i in range(count):
+        contour = points[starts[i] : starts[i + 1]]
+        low = min(contour[:, 0].min(), contour[:, 1].min())
+        high = max(contour[:, 0].max() - width, contour[:, 1].max() - height) + 1
+        if low > border and high < -border:
+            continue
+        if cut == most:
+            break
+        cut += 1
+        quad = _uncut(contour, tolerance * perimeters[i], most_vertices, width, height, border)
         if len(quad) > 0:
             found[i], quads[i] = True, quad
     return found, quads

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astratag.binarise import NO_CONTOURS, Contours, sums_of, threshold_blocks, traced
-from astratag.polygons import bent_quads, clockwise, convex_quads, hull, simplified
+from astratag.polygons import bent_quads, clockwise, convex_quads, uncut_quads
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -243,10 +243,18 @@ def _quads(outlines: Outlines, *, whole: bool) -> Array:
     found, quads = convex_quads(
         contours.points, contours.starts, contours.perimeters, _tolerances(whole), whole, 0 if whole else MAX_HULLS
     )
-    for i in np.flatnonzero(_cut(outlines))[:MAX_CUT].tolist() if not whole else ():
-        uncut = _uncut(contours.contour(i), contours.perimeters[i], outlines.size)
-        if uncut is not None:
-            found[i], quads[i] = True, uncut
+    if not whole:
+        cut, uncut = uncut_quads(
+            contours.points,
+            contours.starts,
+            contours.perimeters,
+            *outlines.size,
+            BORDER_PX,
+            BENT_TOLERANCE,
+            MAX_VERTICES,
+            MAX_CUT,
+        )
+        found, quads = found | cut, np.where(cut[:, None, None], uncut, quads)
     return outlines.in_image(clockwise(quads[found], MIN_SIDE_PX, outlines.outset_px))
 
 
@@ -275,35 +283,5 @@ def _plausible(contours: Contours) -> Contours:
     return contours.chosen(np.flatnonzero(use)[np.argsort(-perimeter[use], kind="stable")[:MAX_CONTOURS]])
 
 
-def _cross(a: Array, b: Array) -> Array:
-    """Return the cross products (...) of vectors (..., 2)."""
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-
-
 def _tolerances(whole: bool) -> Array:
     return np.array(POLYGON_TOLERANCES[: WHOLE_TOLERANCES if whole else None])
-
-
-def _cut(outlines: Outlines) -> NDArray[np.bool_]:
-    """Return which outlines touch the border of the image they were found in."""
-    points, starts = outlines.contours.points, outlines.contours.starts[:-1]
-    low, high = np.minimum.reduceat(points, starts), np.maximum.reduceat(points, starts)
-    last = np.array(outlines.size) - 1
-    return np.asarray((low <= BORDER_PX).any(axis=1) | (high >= last - BORDER_PX).any(axis=1))
-
-
-def _uncut(contour: Array, perimeter: float, size: tuple[int, int]) -> Array | None:
-    """Return the convex quad (4, 2) that the border of an image of a size cut corners off; None if it cut none."""
-    polygon = simplified(hull(contour), BENT_TOLERANCE * perimeter, MAX_VERTICES)
-    after = np.roll(polygon, -1, axis=0)
-    near_low = np.maximum(polygon, after) <= BORDER_PX
-    near_high = np.minimum(polygon, after) >= np.array(size) - 1 - BORDER_PX
-    sides = np.flatnonzero(~(near_low | near_high).any(axis=1))
-    if len(sides) != 4 or len(polygon) == 4:
-        return None
-    along = (after - polygon)[sides]
-    before, start = np.roll(along, 1, axis=0), polygon[np.roll(sides, 1)]
-    turn = _cross(before, along)
-    if not ((turn > 0).all() or (turn < 0).all()):
-        return None
-    return np.asarray(start + before * (_cross(polygon[sides] - start, along) / turn)[:, None])
