@@ -51,7 +51,7 @@ ACROSS, DOWN = np.array([(1, 1, 0, -1, -1, -1, 0, 1), (0, -1, -1, -1, 0, 1, 1, 1
 
 
 def _turns() -> NDArray[np.uint8]:
-    """Return where a border goes on from a pixel, by which neighbours are ink and from which it came (256, 8), in a row.
+    """Return where a border goes on from a pixel, by which of its neighbours are ink and from which it came (2048,).
 
     To the first that is ink, counter-clockwise; and eight times what the pixel is marked with.
     """
@@ -325,9 +325,7 @@ def traced(shapes: Image, worth: Flags, block_px: int, least_px: float) -> tuple
         stop += y * width + 1
         at = _next_border(words, y * width + first, stop)
         while at < stop:
-            length, doubled, straight, slanted = _followed(
-                marks, around, at, y, at - y * width, steps, points, end
-            )
+            length, doubled, straight, slanted = _followed(marks, around, at, y, at - y * width, steps, points, end)
             followed += straight + slanted
             perimeter = straight + slanted * math.sqrt(2.0)
             if length >= 4 and perimeter >= least_px:

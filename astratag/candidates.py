@@ -15,6 +15,7 @@ from astratag.relight import RELIT_SAMPLES, relit_cells
 from astratag.sampling import bilinear
 from astratag.search import BentQuads
 from astratag.signature import (
+    CELL_MIDDLES,
     LEAST_SEEN,
     SAMPLES,
     Artwork,
@@ -22,6 +23,7 @@ from astratag.signature import (
     Reading,
     blur_level,
     cell_values,
+    sample,
 )
 from astratag.tps import KNOTS, ThinPlate
 from astratag.warp import LEAST_DEPTH, BentWarp, FittedWarp, HomographyWarp, plane_of
@@ -32,6 +34,8 @@ Image = NDArray[np.uint8]
 MORE_OF_SMALL = 0.1
 """How much better a square must read that is so small that its code is blurred: blurred codes are like more."""
 MAX_CANDIDATES = 10
+MAX_READ_FLAT = 40
+"""Quads that are read, the likeliest by their cells' middles: of 230 that were markers all were among the first two."""
 LEAST_LIKENESS = 0.45
 """Correlation of a layer, as printed, with what is seen below which it is something else."""
 SURE = 0.85
@@ -87,11 +91,13 @@ def flat_candidates(gray: Image, quads: Array, codebook: Codebook) -> list[Candi
     quads = framed(gray, quads)
     if len(quads) == 0:
         return []
+    if len(quads) > MAX_READ_FLAT:
+        quads = quads[codebook.likeliest(sample(gray, points_in(quads, CELL_MIDDLES)), MAX_READ_FLAT)]
     sides_px = looks_large(quads)
-    readings = codebook.read(cell_values(gray, points_in(quads, SAMPLES)), sides_px)
+    cells = cell_values(gray, points_in(quads, SAMPLES))
     least = codebook.promising() + MORE_OF_SMALL * (blur_level(sides_px) > 0)
-    promising = [pair for *pair, bar in zip(readings, quads, least, strict=True) if pair[0].correlation >= bar]
-    return [_turned(*pair) for pair in sorted(promising, key=lambda pair: -pair[0].correlation)[:MAX_CANDIDATES]]
+    best = codebook.best_readings(cells, least, MAX_CANDIDATES, sides_px)
+    return [_turned(reading, quads[i]) for i, reading in best]
 
 
 def relit_candidates(gray: Image, light: NDArray[np.float32], quads: Array, codebook: Codebook) -> list[Candidate]:

@@ -30,7 +30,17 @@ from astratag.neighbours import Crossings
 from astratag.polygons import simplified, turn
 from astratag.sampling import AS_GRAY, Light
 from astratag.search import Outlines
-from astratag.signature import SAMPLES, Artwork, Codebook, Warp, cell_values, layer_cells, sample, unit
+from astratag.signature import (
+    CELL_MIDDLES,
+    SAMPLES,
+    Artwork,
+    Codebook,
+    Warp,
+    cell_values,
+    layer_cells,
+    sample,
+    unit,
+)
 from astratag.warp import OUTSIDE_PX, FittedWarp
 
 Array = NDArray[np.float64]
@@ -86,7 +96,6 @@ CLEAR_BEND = 5.0
 """A curvature is believed that is so many standard deviations from none."""
 MOVES, DAMPING = 8, 0.03
 """Damped Gauss-Newton steps from a plane through a bent square's corners onto the square."""
-_CELL_MIDDLES = cell_polygons().mean(axis=1)
 
 
 def near_sides(outlines: Outlines) -> Array:
@@ -149,18 +158,18 @@ def curved_candidates(gray: Image, bent: Bent, codebook: Codebook, artwork: Artw
     at = at[darker_inside(gray, bent.project(FRAME), LEAST_FRAMED)][:MAX_GLANCED_AT] if len(at) else at
     if len(at) == 0:
         return []
-    facing = bent.facing(_CELL_MIDDLES, at)
-    glance = _with_middle(sample(gray, bent.project(_CELL_MIDDLES, at)), facing)
-    likeliest = np.argsort(-(unit(glance) @ codebook.unit_codes[0].T).max(axis=1), kind="stable")[:MAX_READ]
-    at, facing = at[likeliest], facing[likeliest]
-    readings = codebook.read(_with_middle(cell_values(gray, bent.project(SAMPLES, at)), facing))
+    middles_px, facing = bent.seen(CELL_MIDDLES, at)
+    best = codebook.likeliest(_with_middle(sample(gray, middles_px), facing), MAX_READ)
+    at, facing = at[best], facing[best]
+    cells = _with_middle(cell_values(gray, bent.project(SAMPLES, at)), facing)
+    corners_px = bent.project(OUTER, at)
     found: list[Candidate] = []
-    for i in sorted(range(len(at)), key=lambda i: -readings[i].correlation):
-        if readings[i].correlation < PROMISING or len(found) == MAX_LOOKED_AT:
+    for i, reading in codebook.best_readings(cells, np.full(len(at), PROMISING), MAX_READ):
+        if len(found) == MAX_LOOKED_AT:
             break
-        turns = readings[i].quarter_turns
-        warp = bent.warp(*at[i].tolist()).turned(turns)
-        candidate = Candidate(readings[i], warp(OUTER), warp, bent=True)
+        turns = reading.quarter_turns
+        corners = np.roll(corners_px[i], -turns, axis=0)
+        candidate = Candidate(reading, corners, bent.warp(*at[i].tolist()).turned(turns), bent=True)
         if candidate.side_px >= LEAST_SIDE_PX and not any(_alike(candidate, before) for before in found):
             found.append(candidate)
     worth = [(_worth(gray, candidate, artwork), candidate) for candidate in found]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -171,13 +172,10 @@ class Bent:
 
     def project(self, template: Array, which: NDArray[np.int64] | None = None) -> Array:
         """Return where template points (S, 2) lie in the image (N, S, 2) for those ``which`` (N, 2), or for ``all``."""
-        return self._seen(template, which)[0]
+        return self.seen(template, which)[0]
 
-    def facing(self, template: Array, which: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which template points (N, S) face the viewer by more than a grazing angle."""
-        return self._seen(template, which)[1]
-
-    def _seen(self, template: Array, which: NDArray[np.int64] | None) -> tuple[Array, NDArray[np.bool_]]:
+    def seen(self, template: Array, which: NDArray[np.int64] | None = None) -> tuple[Array, NDArray[np.bool_]]:
+        """Return the same, and which of the points (N, S) face the viewer by more than a grazing angle."""
         return _project_bent(
             print_from_template(template, 1.0),
             self.curvature,
@@ -240,19 +238,10 @@ def bent_through(camera: Camera, quads: Array, half_angles_rad: tuple[float, ...
     Both poses of each rectangle from the derivative of its homography at the centre: Collins and Bartoli,
     "Infinitesimal plane-based pose estimation", IJCV 2014, equations 14 to 20.
     """
-    models = [(h, axis) for h in half_angles_rad for axis in (0.0, np.pi / 2)]
-    half_angle, axis_rad = (np.repeat(part, 2) for part in np.array(models).T)
-    narrow = 0.5 * np.sin(half_angle) / half_angle  # half the chord across the axis
-    wide = np.full_like(narrow, 0.5)
-    sagitta = 0.5 * (1 - np.cos(half_angle)) / half_angle
-    halves = np.where((axis_rad == 0.0)[:, None], np.stack([wide, narrow], axis=1), np.stack([narrow, wide], axis=1))
-    p, J = _at_centre(camera.undistort(quads.reshape(-1, 2)).reshape(-1, 4, 2))
-    rotation, depth = _two_poses(p[:, None], J[:, None] / halves[None, ::2, None, :])
-    centre = depth[..., None] * np.concatenate([p, np.ones((len(p), 1))], axis=1)[:, None]
-    centre = centre.repeat(2, axis=1)
-    rotation = rotation.reshape(*centre.shape, 3)
-    translation = centre + rotation[..., 2] * sagitta[:, None]
-    return Bent(camera, 2 * half_angle, axis_rad, rotation, translation)
+    half_angles = np.array(half_angles_rad)
+    seen = np.ascontiguousarray(camera.undistort(quads.reshape(-1, 2)).reshape(-1, 4, 2))
+    curvature, axis_rad = np.repeat(2 * half_angles, 4), np.tile((0.0, 0.0, np.pi / 2, np.pi / 2), len(half_angles))
+    return Bent(camera, curvature, axis_rad, *_through(seen, half_angles))
 
 
 def bent_beside(camera: Camera, sides: Array) -> Bent:
@@ -260,27 +249,55 @@ def bent_beside(camera: Camera, sides: Array) -> Bent:
 
     The pose whose rotation is given takes two points to where they are seen: linear in its translation.
     """
-    models = np.array(list(product(HALF_ANGLES_RAD, TURNS_RAD, LEANS_RAD)))
-    half_angle, turn, lean = models.T
+    half_angle, rotations, ends = _beside_models()
     rays = camera.undistort(sides.reshape(-1, 2)).reshape(-1, 2, 2)
-    aim = _aim(rays.mean(axis=1))
     (x, y), zero = (rays[:, 1] - rays[:, 0]).T, np.zeros(len(rays))
     c, s = x / np.hypot(x, y), y / np.hypot(x, y)
-    roll = _matrices([[c, -s, zero], [s, c, zero], [zero, zero, zero + 1]])
-    c, s, zero = np.cos(lean), np.sin(lean), np.zeros(len(models))
+    frames = _aim(rays.mean(axis=1)) @ _matrices([[c, -s, zero], [s, c, zero], [zero, zero, zero + 1]])
+    rotation, translation = _beside(frames, np.ascontiguousarray(rays), rotations, ends)
+    return Bent(camera, 2 * half_angle, 0.0 * half_angle, rotation, translation)
+
+
+@cache
+def _beside_models() -> tuple[Array, Array, Array]:
+    """Return half-angles (M,), rotations (M, 3, 3) by turns and leans, and where the ends of the top are (M, 2, 3)."""
+    half_angle, turn, lean = np.array(list(product(HALF_ANGLES_RAD, TURNS_RAD, LEANS_RAD))).T
+    c, s, zero = np.cos(lean), np.sin(lean), np.zeros(len(lean))
     leant = _matrices([[c, zero, s], [zero, zero + 1, zero], [-s, zero, c]])
     c, s = np.cos(turn), np.sin(turn)
     turned = _matrices([[zero + 1, zero, zero], [zero, -c, s], [zero, -s, -c]])  # y up and z out of the face
-    rotation = (aim @ roll)[:, None] @ (leant @ turned)[None]
     top = print_from_template(square(0.0, TEMPLATE_UNITS)[:2], 1.0)
-    ends = np.stack([Cylinder(0.5 / h).points(top) for h in half_angle])
-    ends_cam = ends @ rotation.swapaxes(-1, -2)
-    A = np.zeros((len(rays), 4, 3))
-    A[:, 0::2, 0] = A[:, 1::2, 1] = 1.0
-    A[:, 0::2, 2], A[:, 1::2, 2] = -rays[..., 0], -rays[..., 1]
-    b = (rays[:, None] * ends_cam[..., 2:] - ends_cam[..., :2]).reshape(*rotation.shape[:2], 4)
-    translation = b @ np.linalg.pinv(A).swapaxes(-1, -2)
-    return Bent(camera, 2 * half_angle, 0.0 * half_angle, rotation, translation)
+    return half_angle, leant @ turned, np.stack([Cylinder(0.5 / h).points(top) for h in half_angle])
+
+
+@compiled(CUBE, CUBE, CUBE, CUBE)
+def _beside(frames: Array, rays: Array, rotations: Array, ends: Array) -> tuple[Array, Array]:
+    """Return poses (Q, M, 3, 3) and (Q, M, 3): each of frames (Q, 3, 3) turned each way (M, 3, 3).
+
+    Translations are those that take ``ends`` (M, 2, 3) to ``rays`` (Q, 2, 2) with the least squared error.
+    """
+    count, models = len(frames), len(rotations)
+    rotation, translation = np.zeros((count, models, 3, 3)), np.empty((count, models, 3))
+    for q in range(count):
+        (u, v), (other_u, other_v) = rays[q]
+        sum_u, sum_v, squares = u + other_u, v + other_v, u * u + v * v + other_u * other_u + other_v * other_v
+        for m in range(models):
+            R = rotation[q, m]
+            for i in range(3):
+                for j in range(3):
+                    for k in range(3):
+                        R[i, j] += frames[q, i, k] * rotations[m, k, j]
+            x, y, across = 0.0, 0.0, 0.0
+            for end in range(2):
+                at, (u, v) = ends[m, end], rays[q, end]
+                depth = R[2, 0] * at[0] + R[2, 1] * at[1] + R[2, 2] * at[2]
+                dx = u * depth - (R[0, 0] * at[0] + R[0, 1] * at[1] + R[0, 2] * at[2])
+                dy = v * depth - (R[1, 0] * at[0] + R[1, 1] * at[1] + R[1, 2] * at[2])
+                x, y, across = x + dx, y + dy, across + u * dx + v * dy
+            z = ((sum_u * x + sum_v * y) / 2 - across) / (squares - (sum_u * sum_u + sum_v * sum_v) / 2)
+            translation[q, m, 0], translation[q, m, 1] = (x + sum_u * z) / 2, (y + sum_v * z) / 2
+            translation[q, m, 2] = z
+    return rotation, translation
 
 
 def _matrices(rows: list[list[Array]]) -> Array:
@@ -297,36 +314,60 @@ def _aim(p: Array) -> Array:
     return _matrices([[1 + k * x * x, k * x * y, x / t], [k * x * y, 1 + k * y * y, y / t], [-x / t, -y / t, 1 / t]])
 
 
-def _at_centre(quads: Array) -> tuple[Array, Array]:
-    """Return where homographies take the centre (Q, 2) of a -1..1 square, y up, and its derivative (Q, 2, 2) there."""
-    p0, p1, p2, p3 = (quads[:, corner] for corner in range(4))
-    d1, d2, total = p1 - p2, p3 - p2, p0 - p1 + p2 - p3
-    area = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
-    area = np.where(np.abs(area) > 1e-12, area, np.inf)
-    g = ((total[:, 0] * d2[:, 1] - total[:, 1] * d2[:, 0]) / area)[:, None]
-    h = ((d1[:, 0] * total[:, 1] - d1[:, 1] * total[:, 0]) / area)[:, None]
-    across, down = p1 - p0 + g * p1, p3 - p0 + h * p3
+@compiled(MATRIX)
+def _at_centre(quad: Array) -> tuple[float, float, Array]:
+    """Return where a homography takes the centre of a -1..1 square, y up, x and y, and its derivative (2, 2) there."""
+    d1, d2, total = quad[1] - quad[2], quad[3] - quad[2], quad[0] - quad[1] + quad[2] - quad[3]
+    area = d1[0] * d2[1] - d1[1] * d2[0]
+    area = area if abs(area) > 1e-12 else np.inf
+    g, h = (total[0] * d2[1] - total[1] * d2[0]) / area, (d1[0] * total[1] - d1[1] * total[0]) / area
+    across, down = quad[1] - quad[0] + g * quad[1], quad[3] - quad[0] + h * quad[3]
     depth = 1 + (g + h) / 2
-    depth = np.where(np.abs(depth) > 1e-6, depth, 1e-6)
-    centre = (p0 + (across + down) / 2) / depth
-    J = np.stack([(across - g * centre) / depth, -(down - h * centre) / depth], axis=2) / 2
-    return centre, J
+    depth = depth if abs(depth) > 1e-6 else 1e-6
+    x, y = (quad[0] + (across + down) / 2) / depth
+    J = np.empty((2, 2))
+    for i, at in enumerate((x, y)):
+        J[i, 0], J[i, 1] = (across[i] - g * at) / depth / 2, -(down[i] - h * at) / depth / 2
+    return x, y, J
 
 
-def _two_poses(p: Array, J: Array) -> tuple[Array, Array]:
-    """Return both rotations (..., 2, 3, 3) and the depth (...) of a plane seen at p (..., 2) with derivative J."""
-    turn = _aim(p)
-    B = turn[..., :2, :2] - p[..., :, None] * turn[..., 2:, :2]
-    A = np.linalg.solve(np.broadcast_to(B, J.shape), J)
-    S = A @ A.swapaxes(-1, -2)
-    mean, gap = (S[..., 0, 0] + S[..., 1, 1]) / 2, np.hypot((S[..., 0, 0] - S[..., 1, 1]) / 2, S[..., 0, 1])
-    gamma = np.maximum(np.sqrt(mean + gap), 1e-12)
-    R2 = A / gamma[..., None, None]
-    square_left = np.maximum(1 - (R2 * R2).sum(axis=-2), 0.0)
-    b = np.sqrt(square_left)
-    b[..., 1] *= np.where((R2[..., 0] * R2[..., 1]).sum(axis=-1) > 0, -1.0, 1.0)
-    both = []
-    for sign in (1.0, -1.0):
-        first, second = (np.concatenate([R2[..., i], sign * b[..., i : i + 1]], axis=-1) for i in (0, 1))
-        both.append(turn @ np.stack([first, second, np.cross(first, second)], axis=-1))
-    return np.stack(both, axis=-3), 1 / gamma
+@compiled(CUBE, VECTOR)
+def _through(quads: Array, half_angles: Array) -> tuple[Array, Array]:
+    """Return poses (Q, 4 H, 3, 3) and (Q, 4 H, 3) of ``bent_through``, of rays at unit depth (Q, 4, 2).
+
+    For each half-angle (H,) both axes, and for each of these both poses.
+    """
+    models = 4 * len(half_angles)
+    rotation, translation = np.empty((len(quads), models, 3, 3)), np.empty((len(quads), models, 3))
+    for q in range(len(quads)):
+        x, y, J = _at_centre(quads[q])
+        k = math.sqrt(x * x + y * y + 1)  # how far a ray reaches at unit depth
+        to = -1 / (k * (k + 1))
+        turn = ((1 + to * x * x, to * x * y, x / k), (to * x * y, 1 + to * y * y, y / k), (-x / k, -y / k, 1 / k))
+        b00, b01 = turn[0][0] - x * turn[2][0], turn[0][1] - x * turn[2][1]
+        b10, b11 = turn[1][0] - y * turn[2][0], turn[1][1] - y * turn[2][1]
+        area = b00 * b11 - b01 * b10
+        for m in range(models):
+            half = half_angles[m // 4]
+            narrow = 0.5 * math.sin(half) / half  # half the chord across the axis
+            right, up = (0.5, narrow) if m % 4 < 2 else (narrow, 0.5)
+            (jxr, jxu), (jyr, jyu) = (J[0, 0] / right, J[0, 1] / up), (J[1, 0] / right, J[1, 1] / up)
+            xr, xu = (b11 * jxr - b01 * jyr) / area, (b11 * jxu - b01 * jyu) / area
+            yr, yu = (b00 * jyr - b10 * jxr) / area, (b00 * jyu - b10 * jxu) / area
+            sxx, syy, sxy = xr * xr + xu * xu, yr * yr + yu * yu, xr * yr + xu * yu
+            gamma = max(math.sqrt((sxx + syy) / 2 + math.hypot((sxx - syy) / 2, sxy)), 1e-12)
+            xr, xu, yr, yu = xr / gamma, xu / gamma, yr / gamma, yu / gamma
+            sign = 1.0 if m % 2 == 0 else -1.0
+            zr = sign * math.sqrt(max(1 - xr * xr - yr * yr, 0.0))
+            zu = sign * math.sqrt(max(1 - xu * xu - yu * yu, 0.0))
+            if xr * xu + yr * yu > 0:
+                zu = -zu
+            columns = ((xr, yr, zr), (xu, yu, zu), (yr * zu - zr * yu, zr * xu - xr * zu, xr * yu - yr * xu))
+            sagitta = 0.5 * (1 - math.cos(half)) / half
+            for i in range(3):
+                for j in range(3):
+                    a, b, c = columns[j]
+                    rotation[q, m, i, j] = turn[i][0] * a + turn[i][1] * b + turn[i][2] * c
+            for i in range(3):
+                translation[q, m, i] = (x, y, 1.0)[i] / gamma + rotation[q, m, i, 2] * sagitta
+    return rotation, translation

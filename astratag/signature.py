@@ -90,6 +90,7 @@ def _smooth(points: Array) -> Array:
 CELL_SAMPLES = _cell_samples()
 ALWAYS_BLACK = _always_black()
 SAMPLES = np.concatenate([CELL_SAMPLES.reshape(-1, 2), ALWAYS_BLACK])
+CELL_MIDDLES = cell_polygons().mean(axis=1)
 _LAYER_SAMPLES = [layer_points(SAMPLES, layer) for layer in LAYERS]
 for _samples in _LAYER_SAMPLES:
     _samples.flags.writeable = False  # so that warps may keep where they are on a surface
@@ -162,11 +163,26 @@ class Codebook:
 
     def read(self, cells: Array, side_px: Array | None = None) -> list[Reading]:
         """Return the best reading of each row of cells (Q, 48); ``side_px`` (Q,) is how large each square looks."""
-        if len(cells) == 0:
-            return []
-        levels = np.zeros(len(cells), dtype=np.int64) if side_px is None else blur_level(side_px)
-        best, found, wrong = _best_codes(cells, levels, self._by_cell, self._bits)
+        best, found, wrong = self._best(cells, side_px)
         return self._readings(best, found, wrong, np.full(len(cells), CELLS))
+
+    def likeliest(self, glances: Array, most: int) -> NDArray[np.int64]:
+        """Return the rows of glances at cells (Q, 48), ``most`` at most, that are most like a code, the best first."""
+        return np.argsort(-(unit(glances) @ self.unit_codes[0].T).max(axis=1), kind="stable")[:most]
+
+    def best_readings(
+        self, cells: Array, least: Array, most: int, side_px: Array | None = None
+    ) -> list[tuple[int, Reading]]:
+        """Return the rows that correlate with at least ``least`` (Q,) and their readings, the best first."""
+        best, found, wrong = self._best(cells, side_px)
+        rows = np.argsort(-found, kind="stable")
+        rows = rows[found[rows] >= least[rows]][:most]
+        readings = self._readings(best[rows], found[rows], wrong[rows], np.full(len(rows), CELLS))
+        return list(zip(rows.tolist(), readings, strict=True))
+
+    def _best(self, cells: Array, side_px: Array | None) -> tuple[NDArray[np.int64], Array, NDArray[np.int64]]:
+        levels = np.zeros(len(cells), dtype=np.int64) if side_px is None else blur_level(side_px)
+        return _best_codes(cells, levels, self._by_cell, self._bits)
 
     def read_seen(self, cells: Array, seen: NDArray[np.bool_]) -> list[Reading]:
         """Return the best reading of each row of cells (Q, 48) when only those that are ``seen`` (Q, 48) count."""

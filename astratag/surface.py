@@ -6,12 +6,14 @@ that centre; a print is wrapped without stretching.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from astratag.checks import finite, positive
+from astratag.compiled import MATRIX, REAL, compiled
 
 Array = NDArray[np.float64]
 
@@ -44,23 +46,38 @@ class Cylinder:
         positive(self.radius_m, "radius_m", "length in metres, and a flat marker is Flat()")
         finite(self.axis_rad, "axis_rad")
 
-    @property
-    def _along_across(self) -> tuple[Array, Array]:
-        c, s = np.cos(self.axis_rad), np.sin(self.axis_rad)
-        return np.array([c, s]), np.array([-s, c])
-
     def points(self, on_print: Array) -> Array:
         """Return print points (..., 2) in the marker frame (..., 3), metres."""
-        along, across = self._along_across
-        a, b = on_print @ along, on_print @ across / self.radius_m
-        flat = a[..., None] * along + (self.radius_m * np.sin(b))[..., None] * across
-        return np.concatenate([flat, (self.radius_m * (np.cos(b) - 1.0))[..., None]], axis=-1)
+        return self._wrapped(on_print)[0]
 
     def normals(self, on_print: Array) -> Array:
         """Return outward unit normals (..., 3) at print points (..., 2)."""
-        _, across = self._along_across
-        b = on_print @ across / self.radius_m
-        return np.concatenate([np.sin(b)[..., None] * across, np.cos(b)[..., None]], axis=-1)
+        return self._wrapped(on_print)[1]
+
+    def _wrapped(self, on_print: Array) -> tuple[Array, Array]:
+        shape = (*np.shape(on_print)[:-1], 3)
+        flat = np.ascontiguousarray(np.reshape(on_print, (-1, 2)), dtype=float)
+        points, normals = _wrapped(flat, self.radius_m, self.axis_rad)
+        return points.reshape(shape), normals.reshape(shape)
+
+
+@compiled(MATRIX, REAL, REAL)
+def _wrapped(on_print: Array, radius_m: float, axis_rad: float) -> tuple[Array, Array]:
+    """Return the points and outward normals (N, 3) of print points (N, 2) wrapped about a cylinder."""
+    points, normals = np.empty((len(on_print), 3)), np.empty((len(on_print), 3))
+    c, s = math.cos(axis_rad), math.sin(axis_rad)
+    for i in range(len(on_print)):
+        x, y = on_print[i, 0], on_print[i, 1]
+        along, angle = c * x + s * y, (c * y - s * x) / radius_m
+        sine, cosine = math.sin(angle), math.cos(angle)
+        across = radius_m * sine
+        points[i, 0], points[i, 1], points[i, 2] = (
+            c * along - s * across,
+            s * along + c * across,
+            radius_m * (cosine - 1),
+        )
+        normals[i, 0], normals[i, 1], normals[i, 2] = -s * sine, c * sine, cosine
+    return points, normals
 
 
 Surface = Flat | Cylinder
