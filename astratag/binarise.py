@@ -136,53 +136,6 @@ def sums_of(gray: Image) -> NDArray[np.int32]:
     return np.asarray(cv2.integral(wider, sdepth=cv2.CV_32S))
 
 
-@compiled(GRAY, TABLE, FLAG_MATRIX, INT, INT, INT, BOOL)
-def threshold_blocks(
-    gray: Image, sums: NDArray[np.int32], worth: Flags, block_px: int, window_px: int, offset: int, holes: bool
-) -> tuple[Image, int]:
-    """Return 1 where an image (H, W) is ``offset`` below the mean around it, or with ``holes`` above; else 0.
-
-    As OpenCV's ``adaptiveThreshold``, in blocks of ``block_px`` that are ``worth`` it (R, C), and 0 elsewhere; with a
-    border of 0 around it (H + 2, W + 2 or a few more).  ``sums`` are of ``sums_of``.  Second, how often neighbours in a
-    row differ.
-    """
-    height, width = gray.shape
-    shapes = np.zeros((height + 2, -(-(width + 2) // WORD) * WORD), dtype=np.uint8)
-    reach, changes = window_px // 2, 0
-    area = np.float32(window_px * window_px)
-    half = np.float32(0.5) * area
-    apart = np.float32(offset) * area
-    for row in range(worth.shape[0]):
-        column = 0
-        while column < worth.shape[1]:
-            if not worth[row, column]:
-                column += 1
-                continue
-            first = column
-            while column < worth.shape[1] and worth[row, column]:
-                column += 1
-            left, right = first * block_px, min(column * block_px, width)
-            before, after = left + MOST_REACH_PX - reach, left + MOST_REACH_PX + reach + 1
-            count = right - left
-            for y in range(row * block_px, min((row + 1) * block_px, height)):
-                above, below = sums[y + MOST_REACH_PX - reach], sums[y + MOST_REACH_PX + reach + 1]
-                a, b = above[before : before + count], above[after : after + count]
-                c, d = below[before : before + count], below[after : after + count]
-                level, shape = gray[y, left:right], shapes[y + 1, left + 1 : right + 1]
-                if holes:
-                    for x in range(count):
-                        total = np.float32(np.int32(d[x] - c[x] - b[x] + a[x]))
-                        shape[x] = np.uint8(np.float32(level[x]) * area - apart - half > total)
-                else:
-                    for x in range(count):
-                        total = np.float32(np.int32(d[x] - c[x] - b[x] + a[x]))
-                        shape[x] = np.uint8(np.float32(level[x]) * area + apart - half <= total)
-                for x in range(1, count):
-                    changes += shape[x] != shape[x - 1]
-                changes += (left > 0 and shape[0] != 0) + (right < width and shape[count - 1] != 0)
-    return shapes, changes
-
-
 @compiled(FLAG_MATRIX, INT, INT, INT)
 def _spans(worth: Flags, block_px: int, height: int, width: int) -> Indices:
     """Return the parts of rows that lie in blocks that are ``worth`` it (S, 3): y, first x, and the one after the last.
@@ -202,6 +155,43 @@ def _spans(worth: Flags, block_px: int, height: int, width: int) -> Indices:
             spans[count, 2] = min(column * block_px, width) + 1
             count += 1
     return spans[:count]
+
+
+@compiled(GRAY, TABLE, FLAG_MATRIX, INT, INT, INT, BOOL)
+def threshold_blocks(
+    gray: Image, sums: NDArray[np.int32], worth: Flags, block_px: int, window_px: int, offset: int, holes: bool
+) -> tuple[Image, int]:
+    """Return 1 where an image (H, W) is ``offset`` below the mean around it, or with ``holes`` above; else 0.
+
+    As OpenCV's ``adaptiveThreshold``, in blocks of ``block_px`` that are ``worth`` it (R, C), and 0 elsewhere; with a
+    border of 0 around it (H + 2, W + 2 or a few more).  ``sums`` are of ``sums_of``.  Second, how often neighbours in a
+    row differ.
+    """
+    height, width = gray.shape
+    shapes = np.zeros((height + 2, -(-(width + 2) // WORD) * WORD), dtype=np.uint8)
+    reach, changes = window_px // 2, 0
+    area = np.float32(window_px * window_px)
+    half = np.float32(0.5) * area
+    apart = np.float32(offset) * area
+    for y, first, stop in _spans(worth, block_px, height, width):
+        left, right, count = first - 1, stop - 1, stop - first
+        before, after = left + MOST_REACH_PX - reach, left + MOST_REACH_PX + reach + 1
+        above, below = sums[y - 1 + MOST_REACH_PX - reach], sums[y + MOST_REACH_PX + reach]
+        a, b = above[before : before + count], above[after : after + count]
+        c, d = below[before : before + count], below[after : after + count]
+        level, shape = gray[y - 1, left:right], shapes[y, first:stop]
+        if holes:
+            for x in range(count):
+                total = np.float32(np.int32(d[x] - c[x] - b[x] + a[x]))
+                shape[x] = np.uint8(np.float32(level[x]) * area - apart - half > total)
+        else:
+            for x in range(count):
+                total = np.float32(np.int32(d[x] - c[x] - b[x] + a[x]))
+                shape[x] = np.uint8(np.float32(level[x]) * area + apart - half <= total)
+        for x in range(1, count):
+            changes += shape[x] != shape[x - 1]
+        changes += (left > 0 and shape[0] != 0) + (right < width and shape[count - 1] != 0)
+    return shapes, changes
 
 
 @compiled(GRAY, INDEX_MATRIX)

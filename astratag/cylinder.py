@@ -8,7 +8,7 @@ seen whole, that side and the angle the print is turned by fix one.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from itertools import product
 
@@ -48,7 +48,7 @@ class CylinderWarp:
     @classmethod
     def of(cls, camera: Camera, side_m: float, curvature: float, axis_rad: float, T_cam_marker: Array) -> CylinderWarp:
         """Return a print at ``T_cam_marker`` with ``curvature`` sides per radius, kept within what is believable."""
-        curvature = float(np.clip(curvature, LEAST_CURVATURE, MOST_CURVATURE))
+        curvature = min(max(float(curvature), LEAST_CURVATURE), MOST_CURVATURE)
         return cls(PoseWarp(camera, side_m, Cylinder(side_m / curvature, float(axis_rad)), T_cam_marker))
 
     @property
@@ -95,7 +95,7 @@ class CylinderWarp:
 
     def step_sigma(self) -> Array:
         """Return limits (8,) on curvature and axis only."""
-        return np.append(np.full(6, np.inf), (CURVATURE_STEP, AXIS_STEP_RAD))
+        return _STEP_SIGMA
 
     def of_whole(self, side_m: float, scale: float) -> CylinderWarp:
         """Return the warp of a print ``side_m`` wide, given that of the square in its middle, ``scale`` of its size."""
@@ -106,9 +106,14 @@ class CylinderWarp:
     def turned(self, quarter_turns: int) -> CylinderWarp:
         """Return the same print with its top at the side ``quarter_turns`` clockwise of this one's."""
         c, s = ((1, 0), (0, -1), (-1, 0), (0, 1))[quarter_turns % 4]
-        T = self.pose.T_cam_marker @ pose(np.array([(c, -s, 0), (s, c, 0), (0, 0, 1)], dtype=float), np.zeros(3))
-        axis_rad = self.surface.axis_rad + quarter_turns * np.pi / 2
-        return replace(self, pose=replace(self.pose, surface=replace(self.surface, axis_rad=axis_rad), T_cam_marker=T))
+        T, surface = self.pose.T_cam_marker.copy(), self.surface
+        x, y = T[:3, 0].copy(), T[:3, 1].copy()
+        T[:3, 0], T[:3, 1] = c * x + s * y, c * y - s * x
+        surface = Cylinder(surface.radius_m, surface.axis_rad + quarter_turns * np.pi / 2)
+        return CylinderWarp(PoseWarp(self.pose.camera, self.pose.side_m, surface, T))
+
+
+_STEP_SIGMA = np.append(np.full(6, np.inf), (CURVATURE_STEP, AXIS_STEP_RAD))
 
 
 @compiled(MATRIX, MATRIX, VECTOR, REAL, REAL, REAL)
@@ -116,27 +121,28 @@ def _by_surface(
     on_print: Array, T_cam_marker: Array, lens: Array, radius_m: float, axis_rad: float, side_m: float
 ) -> Array:
     """Return how the pixels of print points (N, 2) move with the cylinder's curvature and axis (N, 2, 2)."""
-    T, c, s = T_cam_marker, np.cos(axis_rad), np.sin(axis_rad)
+    T, c, s = T_cam_marker, math.cos(axis_rad), math.sin(axis_rad)
     radius_step = -(radius_m**2) / side_m  # d radius / d curvature
     J = np.empty((len(on_print), 2, 2))
     for i in range(len(on_print)):
-        x, y = on_print[i]
+        x, y = on_print[i, 0], on_print[i, 1]
         a, b = c * x + s * y, c * y - s * x  # along the axis, and across it
         angle = b / radius_m
-        sine, cosine = np.sin(angle), np.cos(angle)
-        bowed = radius_step * (sine - angle * cosine)
-        by_curvature = (-s * bowed, c * bowed, radius_step * (cosine - 1 + angle * sine))
-        slid, turned = b - radius_m * sine, a * (1 - cosine)
-        by_axis = (c * slid - s * turned, s * slid + c * turned, a * sine)
-        across = radius_m * sine
-        point = (c * a - s * across, s * a + c * across, radius_m * (cosine - 1))
-        at = [T[k, 0] * point[0] + T[k, 1] * point[1] + T[k, 2] * point[2] + T[k, 3] for k in range(3)]
+        sine, cosine = math.sin(angle), math.cos(angle)
+        across, inward = radius_m * sine, radius_m * (cosine - 1)
+        px, py = c * a - s * across, s * a + c * across
+        X = T[0, 0] * px + T[0, 1] * py + T[0, 2] * inward + T[0, 3]
+        Y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * inward + T[1, 3]
+        Z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * inward + T[2, 3]
+        bowed, slid, turned = radius_step * (sine - angle * cosine), b - across, a * (1 - cosine)
+        ux, uy, uz = -s * bowed, c * bowed, radius_step * (cosine - 1 + angle * sine)  # by curvature
+        vx, vy, vz = c * slid - s * turned, s * slid + c * turned, a * sine  # by the axis
         for axis in range(2):
-            gx, gy, gz = pixel_slope(at[0], at[1], at[2], lens, 1.0 - axis, 1.0 * axis)
-            for column, by in enumerate((by_curvature, by_axis)):
-                J[i, axis, column] = 0.0
-                for k in range(3):
-                    J[i, axis, column] += by[k] * (T[0, k] * gx + T[1, k] * gy + T[2, k] * gz)
+            gx, gy, gz = pixel_slope(X, Y, Z, lens, 1.0 - axis, 1.0 * axis)
+            wx = T[0, 0] * gx + T[1, 0] * gy + T[2, 0] * gz
+            wy = T[0, 1] * gx + T[1, 1] * gy + T[2, 1] * gz
+            wz = T[0, 2] * gx + T[1, 2] * gy + T[2, 2] * gz
+            J[i, axis, 0], J[i, axis, 1] = ux * wx + uy * wy + uz * wz, vx * wx + vy * wy + vz * wz
     return J
 
 

@@ -15,9 +15,9 @@ SAME_SQUARE = 0.04
 """Squares whose centres and sides differ by less than this fraction are one square found twice."""
 BETTER = 0.03
 """A square that was looked at is looked at again where it reads so much better."""
-LEAST_UNITS, UNITS_A_PIXEL, MOST_UNITS = 12_000, 0.065, 34_000
+LEAST_UNITS, UNITS_A_PIXEL, MOST_UNITS = 8_500, 0.057, 27_000
 """What one image is worth whatever its size, and more for each pixel, up to a limit: what the hardest markers of the
-benchmark take, which at 640x480 is 31 000.  A plain one with a marker takes a tenth to a twentieth of it.
+benchmark take, which at 640x480 is 26 000.  A plain one with a marker takes about a thousand.
 
 A unit is what takes about a microsecond, counted and never measured, so that the same image always gets the same.
 """
@@ -48,25 +48,25 @@ class Effort:
 class Costs:
     """What is done in an image, in units."""
 
-    pixel: float = 0.0025
+    pixel: float = 0.0015
     """Of a picture in which outlines are looked for."""
-    resized_pixel: float = 0.0005
+    resized_pixel: float = 0.0004
     """More of the whole picture, at the resolution worked at."""
-    border_pixel: float = 0.03
+    border_pixel: float = 0.012
     """Of the borders of all shapes: followed, or looked through for near sides."""
-    outline: float = 10.0
+    outline: float = 7.0
     """Simplified, and read as if flat."""
-    edges: float = 700.0
-    aligned: float = 1400.0
-    bent: float = 1.0
+    edges: float = 400.0
+    aligned: float = 1000.0
+    bent: float = 0.9
     """A bent square whose frame is looked at."""
     bent_read: float = 600.0
     """Those that have one, and how the best look."""
-    curved: float = 1500.0
-    relit: float = 15.0
+    curved: float = 2300.0
+    relit: float = 18.0
     """An outline read cell by cell."""
-    by_pixels: float = 150.0
-    matched: float = 3500.0
+    by_pixels: float = 500.0
+    matched: float = 2000.0
     spline: float = 350.0
 
 

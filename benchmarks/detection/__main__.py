@@ -25,6 +25,7 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
 from rich.table import Table
 
+from benchmarks.detection.clutter import measure_clutter
 from benchmarks.detection.cost import measure_cost
 from benchmarks.detection.false_accepts import FIRST_SEED, measure_false_accepts
 from benchmarks.detection.figures import draw_condition, draw_cost, rows_of
@@ -34,7 +35,7 @@ from benchmarks.detection.recall import SIZES, measure
 from benchmarks.detection.scenes import CONDITIONS, Condition
 
 REAL_FRAMES = Path(__file__).resolve().parents[3] / "shared" / "reference" / "frames"
-PARTS = (*(condition.name for condition in CONDITIONS), "cost", "profile", "false-accepts")
+PARTS = (*(condition.name for condition in CONDITIONS), "cost", "clutter", "profile", "false-accepts")
 CONSOLE = Console(width=200)
 
 
@@ -100,6 +101,24 @@ def show_cost(rows: Sequence[dict]) -> None:
     CONSOLE.print(table)
 
 
+def show_clutter(rows: Sequence[dict]) -> None:
+    """Print CPU milliseconds of pictures without a marker, and how many times those of a plain one with one."""
+    title = "Pictures without a marker: CPU ms of the median and of the worst (times a plain one with a marker)"
+    table = Table(title=title, title_justify="left", box=None)
+    sizes = list(dict.fromkeys(row["image"] for row in rows))
+    table.add_column("")
+    for size in sizes:
+        table.add_column(size, justify="right")
+    for name in dict.fromkeys(row["entrant"] for row in rows):
+        mine = {row["image"]: row for row in rows if row["entrant"] == name}
+        cells = (
+            f"{row['median_ms']:.1f} ({row['median_times']:.1f}x), {row['worst_ms']:.1f} ({row['worst_times']:.1f}x)"
+            for row in (mine[size] for size in sizes)
+        )
+        table.add_row(name, *cells)
+    CONSOLE.print(table)
+
+
 def show_profile(rows: Sequence[dict]) -> None:
     """Print how a search's CPU time divides between OpenCV, the compiled functions, and the Python around them."""
     table = Table(title="A search, CPU ms", title_justify="left", box=None)
@@ -153,6 +172,9 @@ def main() -> None:
         results["cost"] = cost = measure_cost(options.images, (*entrants, TRACKED))
         show_cost(cost)
         draw_cost(cost, options.out)
+    if "clutter" in parts:
+        results["clutter"] = cluttered = measure_clutter(entrants)
+        show_clutter(cluttered)
     if "profile" in parts:
         results["profile"] = profile = measure_profile(options.images)
         show_profile(profile)
