@@ -68,7 +68,7 @@ def clutter(one: Draw) -> Iterator[tuple[str, Image]]:
 
 
 def measure_clutter(entrants: tuple[Entrant, ...] = ENTRANTS) -> list[dict]:
-    """Return a row for each image size and entrant: CPU milliseconds of a plain picture, and of the median and worst."""
+    """Return a row for each image size and entrant: CPU milliseconds of a plain picture, the median and the worst."""
     cv2.setNumThreads(1)
     rows = []
     for name, scene in SCENES.items():
