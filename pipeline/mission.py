@@ -218,7 +218,7 @@ class FilterSection(Section):
     """How far a whole picture may be shifted: more where the camera shakes or stamps are late."""
     initial_speed_m_s: float = Field(default=0.2, gt=0)
     initial_rate_rad_s: float = Field(default=0.2, gt=0)
-    gate_probability: float = Field(default=0.999999, gt=0.5, lt=1)
+    gate_probability: float = Field(default=0.999999999, gt=0.5, lt=1)
     """Share of true measurements that a gate lets through: layers whose sigma is half too small must pass it too."""
     ambiguity_ratio: float = Field(default=1e4, gt=1)
     """How many times likelier one of two poses must become before the other is dropped."""

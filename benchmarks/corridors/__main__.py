@@ -5,11 +5,11 @@ range and saves ``out/corridors/corridors.png`` and ``.json``.  ``--reuse`` take
 rendered, ``--only NAME`` one corridor.
 
 A rendering knows its focal length exactly, and no mission does: the filter reckons with an error of ``scale_sigma``
-that is not there, and seems too cautious by that much.  So NEES is judged with focal lengths that are off as the mission
-says: as a square of errors it has the mean over all of them that two flights have, one told a focal length a standard
-deviation too long and one too short.  What it is with the exact one stands beside it, and so do errors and bound, which
-are of the corners.  All approaches are as smooth as they were drawn, where the filter reckons with accelerations that
-change at any time: of velocities and rates it knows more than it claims.
+that is not there, and seems too cautious by that much.  So NEES is judged with focal lengths that are off as the
+mission says: as a square of errors it has the mean over all of them that two flights have, one told a focal length a
+standard deviation too long and one too short.  What it is with the exact one stands beside it, and so do errors and
+bound, which are of the corners.  All approaches are as smooth as they were drawn, where the filter reckons with
+accelerations that change at any time: of velocities and rates it knows more than it claims.
 """
 
 from __future__ import annotations
