@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from astratag.camera import Camera, pixel, pixel_slope
 from astratag.compiled import CUBE, FLAGS, INDICES, INT, MATRIX, REAL, VECTOR, compiled
 from pipeline.dynamics import ATTITUDE, POSITION, SCALE, SHIFT, STATES, Motion
-from pipeline.lasting import CORNERS, OUTWARD, PER_LAYER
+from pipeline.lasting import EDGES, OUTWARD, PER_LAYER, TURNS
 from pipeline.mission import FilterSection
 
 Array = NDArray[np.float64]
@@ -23,13 +23,15 @@ CORNER_DOF = 8
 """Image coordinates of the four corners of one black square."""
 TINY = float(np.finfo(float).tiny)
 SHARPEST = 0.1
-"""One plus the cosine between neighbouring edges' normals, bounded so that a needle's corner stays near."""
+"""Sine between neighbouring edges, or its square, bounded so that a needle's corner stays near."""
 NEAREST_M = 1e-3
 """A corner nearer to the camera than this, or behind it, is not a measurement that can be linearised."""
 LINEAR_SHARE = 0.02
 """Where curvature moves corners by less than this share of their noise, one iteration is enough."""
-LEAST_WHITE = 0.55
+LEAST_WHITE = 0.3
 """Share of a corner's variance that is new in each picture, however much of it could last."""
+LASTS_TO_PX = 140.0
+"""Extent of a layer up to which all lasts of a sigma that can: beyond, the less the farther its edges are apart."""
 LINES_FROM_PX = 60.0
 """Extent of a marker's largest layer from which on corners err like ends of lines along edges: measured, as smaller
 prints are matched pixel by pixel."""
@@ -38,7 +40,7 @@ LEAST_ALONE = 0.01
 LASTING_LOOKS = 20
 """How many looks an error of the attitude lasts while it is large: 2 s of pictures, until others outweigh them."""
 FIRST_OF_POSITION, FIRST_OF_ATTITUDE, FIRST_OF_SHIFT = POSITION.start, ATTITUDE.start, SHIFT.start
-FIRST_OF_CORNERS = CORNERS.start
+FIRST_OF_EDGES, FIRST_OF_TURNS = EDGES.start, TURNS.start
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,27 +110,30 @@ def corner_noise(layers: Sequence[SeenLayer], noise: FilterSection) -> Array:
         np.array([layer.sigma_px for layer in layers]),
         np.array([bool(by_lines and largest_px[layer.marker_id] >= LINES_FROM_PX) for layer in layers]),
         noise.edge_end_correlation,
-        noise.lasting_sigma_px**2,
+        noise.lasting_sigma_px**2 * np.minimum(1.0, LASTS_TO_PX / np.maximum(sides_px, 1.0)),
         noise.picture_shift_px**2,
     )
 
 
 def with_lasting(H: Array, predicted_px: Array, slots: Sequence[int], columns: int) -> Array:
     """Return slopes (8 L, ``columns``): those by the motion (8 L, 21), and those by the layers' lasting errors."""
-    outward = outward_shift(predicted_px.reshape(-1, 4, 2)).reshape(-1, CORNER_DOF)
-    return _with_lasting(H, outward, np.array(slots, dtype=np.int64), columns)
+    edges = edge_shifts(predicted_px.reshape(-1, 4, 2)).reshape(-1, 4, CORNER_DOF)
+    return _with_lasting(H, edges, np.array(slots, dtype=np.int64), columns)
 
 
-@compiled(MATRIX, MATRIX, INDICES, INT)
-def _with_lasting(H: Array, outward: Array, slots: NDArray[np.int64], columns: int) -> Array:
+@compiled(MATRIX, CUBE, INDICES, INT)
+def _with_lasting(H: Array, edges: Array, slots: NDArray[np.int64], columns: int) -> Array:
     whole = np.zeros((len(H), columns))
     for row in range(len(H)):
         layer, coordinate = row // CORNER_DOF, row % CORNER_DOF
         for column in range(STATES):
             whole[row, column] = H[row, column]
         first = STATES + PER_LAYER * slots[layer]
-        whole[row, first + OUTWARD] = outward[layer, coordinate]
-        whole[row, first + FIRST_OF_CORNERS + coordinate] = 1.0
+        for edge in range(4):
+            shift = edges[layer, edge, coordinate]
+            whole[row, first + OUTWARD] += shift
+            whole[row, first + FIRST_OF_EDGES + edge] = shift
+            whole[row, first + FIRST_OF_TURNS + edge] = -shift if coordinate // 2 == edge else shift
     return whole
 
 
@@ -265,16 +270,22 @@ def cross_rows(points: Array, rows: Array) -> Array:
 
 
 def outward_shift(quads_px: Array) -> Array:
-    """Return how corners (L, 4, 2) move when every edge of their quad moves outward by a pixel.
+    """Return how corners (L, 4, 2) move when every edge of their quad moves outward by a pixel."""
+    return edge_shifts(quads_px).sum(axis=1)
 
-    A corner moves by d with d.n = 1 for the outward normals n of both its edges.
+
+def edge_shifts(quads_px: Array) -> Array:
+    """Return how corners (L, 4, 4, 2) move when one edge, that from a corner to the next, moves outward by a pixel.
+
+    A corner slides along the other of its edges: by d with d.n = 1 for the outward normal n of the one that moves, and
+    d.n = 0 for that of the other.
     """
-    return _outward_shift(np.ascontiguousarray(quads_px, dtype=float))
+    return _edge_shifts(np.ascontiguousarray(quads_px, dtype=float))
 
 
 @compiled(CUBE)
-def _outward_shift(quads_px: Array) -> Array:
-    shift, normals = np.empty(quads_px.shape), np.empty((4, 2))
+def _edge_shifts(quads_px: Array) -> Array:
+    shifts, normals = np.zeros((len(quads_px), 4, 4, 2)), np.empty((4, 2))
     for q in range(len(quads_px)):
         quad, turn = quads_px[q], 0.0
         for i in range(4):
@@ -284,20 +295,24 @@ def _outward_shift(quads_px: Array) -> Array:
             length = max(np.sqrt(x * x + y * y), TINY)
             normals[i, 0], normals[i, 1] = y / length, -x / length
         for i in range(4):
+            last = (i + 3) % 4
             x, y = normals[i]
-            before_x, before_y = normals[(i + 3) % 4]
-            share = np.sign(turn) / max(1 + before_x * x + before_y * y, SHARPEST)
-            shift[q, i, 0], shift[q, i, 1] = share * (before_x + x), share * (before_y + y)
-    return shift
+            before_x, before_y = normals[last]
+            cosine = before_x * x + before_y * y
+            share = np.sign(turn) / max(1 - cosine * cosine, SHARPEST)
+            shifts[q, i, i, 0], shifts[q, i, i, 1] = share * (x - cosine * before_x), share * (y - cosine * before_y)
+            shifts[q, last, i, 0] = share * (before_x - cosine * x)
+            shifts[q, last, i, 1] = share * (before_y - cosine * y)
+    return shifts
 
 
-@compiled(CUBE, VECTOR, FLAGS, REAL, REAL, REAL)
+@compiled(CUBE, VECTOR, FLAGS, REAL, VECTOR, REAL)
 def _corner_noise(
     quads_px: Array,
     sigma_px: Array,
     by_lines: NDArray[np.bool_],
     correlation: float,
-    lasting_px2: float,
+    lasting_px2: Array,
     shift_px2: float,
 ) -> Array:
     """Return the covariance (8 L, 8 L) of corners (L, 4, 2), which may be where lines along the edges meet.
@@ -322,7 +337,7 @@ def _corner_noise(
                 -before_y / max(before, TINY) / sine,
             )
             power += 2 / (8 * sine * sine)
-        variance_px2 = max(sigma_px[q] ** 2 - lasting_px2, LEAST_WHITE * sigma_px[q] ** 2)
+        variance_px2 = max(sigma_px[q] ** 2 - lasting_px2[q], LEAST_WHITE * sigma_px[q] ** 2)
         alone = LEAST_ALONE if by_lines[q] else 1.0
         scale = (1 - alone) * variance_px2 / power
         for i in range(4):

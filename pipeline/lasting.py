@@ -2,10 +2,10 @@
 while, and is no smaller after many looks.
 
 Of each black square: how far all its edges lie outside their place, of which all squares have a share in common, as
-blur and exposure are of the whole picture; and beside that how far each corner is off by itself, image axes.  Each is
-a first-order Gauss-Markov process (A. E. Bryson, Y.-C. Ho, "Applied optimal control", 1975),
-whose stationary spread and correlation time the mission has; it joins the filter's error state, behind the motion's,
-when the layer is first seen, and leaves it once the layer was away for so long that little of it is left.
+blur and exposure are of the whole picture; and beside that how far each edge lies outside by itself, and how far it is
+turned.  Each is a first-order Gauss-Markov process (A. E. Bryson, Y.-C. Ho, "Applied optimal control", 1975), whose
+stationary spread and correlation time the mission has; it joins the filter's error state, behind the motion's, when the
+layer is first seen, and leaves it once the layer was away for so long that little of it is left.
 """
 
 from __future__ import annotations
@@ -22,13 +22,16 @@ Array = NDArray[np.float64]
 Key = tuple[int, int]
 """Marker and layer."""
 
-OUTWARD, CORNERS = 0, slice(1, 9)
+OUTWARD, EDGES, TURNS = 0, slice(1, 5), slice(5, 9)
 PER_LAYER = 9
 
 
 @dataclass(frozen=True, eq=False)
 class LastingErrors:
-    """The estimate of every layer's lasting errors, px: outward, then the corners' coordinates in the marker's order.
+    """The estimate of every layer's lasting errors, px.
+
+    Outward; each edge by itself, from the one at the top clockwise; how far the end of each is outside and its
+    beginning inside.
 
     Nothing is changed in place.
     """
@@ -69,7 +72,7 @@ class LastingErrors:
 
     def kept(self, noise: FilterSection) -> list[int]:
         """Return which of them were seen so lately that more is known of them than of new ones."""
-        longest_s = max(noise.edge_bias_correlation_s, noise.corner_bias_correlation_s)
+        longest_s = max(noise.edge_bias_correlation_s, noise.one_edge_bias_correlation_s)
         return [k for k, s in enumerate(self.unseen_s) if s <= longest_s]
 
     def only(self, chosen: Sequence[int]) -> LastingErrors:
@@ -81,13 +84,14 @@ class LastingErrors:
 
 def is_modelled(noise: FilterSection) -> bool:
     """Tell whether a mission knows of any lasting errors."""
-    return noise.edge_bias_px > 0 or noise.corner_bias_px > 0
+    return max(noise.edge_bias_px, noise.one_edge_bias_px, noise.edge_turn_px) > 0
 
 
 def variances_px2(noise: FilterSection) -> Array:
     """Return the stationary variances (9,) px^2 of a layer's lasting errors."""
-    variances = np.full(PER_LAYER, noise.corner_bias_px**2)
+    variances = np.empty(PER_LAYER)
     variances[OUTWARD] = noise.edge_bias_px**2
+    variances[EDGES], variances[TURNS] = noise.one_edge_bias_px**2, noise.edge_turn_px**2
     return variances
 
 
@@ -133,6 +137,6 @@ def with_new_covariance(P: Array, known: int, new: int, noise: FilterSection) ->
 
 def decay(dt_s: float, noise: FilterSection) -> Array:
     """Return the shares (9,) of a layer's lasting errors that are left after ``dt_s`` seconds."""
-    shares = np.full(PER_LAYER, np.exp(-dt_s / noise.corner_bias_correlation_s))
+    shares = np.full(PER_LAYER, np.exp(-dt_s / noise.one_edge_bias_correlation_s))
     shares[OUTWARD] = np.exp(-dt_s / noise.edge_bias_correlation_s)
     return shares

@@ -191,16 +191,18 @@ class FilterSection(Section):
     acceleration_m_s2: float = Field(default=0.003, gt=0)
     """Standard deviation of the relative acceleration, along each axis: slow approaches without burns."""
     angular_acceleration_rad_s2: float = Field(default=0.01, gt=0)
-    correlation_s: float = Field(default=5.0, gt=0)
-    """How long both last."""
+    correlation_s: float = Field(default=8.0, gt=0)
+    """How long both last: braking, swaying and tumbling do for a good part of their period."""
     edge_bias_px: float = Field(default=0.02, ge=0)
     """How far the edges of a black square may be measured outside or inside their place, all four by the same."""
     edge_bias_shared: float = Field(default=0.5, ge=0, lt=1)
     """Of that variance, what is the same for all black squares: blur and exposure are of the whole picture."""
     edge_bias_correlation_s: float = Field(default=10.0, gt=0)
-    corner_bias_px: float = Field(default=0.01, ge=0)
-    """How far each corner may be off by itself for long: repeated looks do not find that out."""
-    corner_bias_correlation_s: float = Field(default=2.0, gt=0)
+    one_edge_bias_px: float = Field(default=0.01, ge=0)
+    """How far each edge may be outside by itself for long: repeated looks do not find that out."""
+    edge_turn_px: float = Field(default=0.006, ge=0)
+    """How far the end of each edge may be outside for long, and its beginning inside."""
+    one_edge_bias_correlation_s: float = Field(default=2.0, gt=0)
     lasting_sigma_px: float = Field(default=0.018, ge=0)
     """How much of the sigma that a detector gives is of such errors, and not new in each picture."""
     edge_end_correlation: float = Field(default=-0.5, gt=-1, lt=1)
@@ -212,11 +214,11 @@ class FilterSection(Section):
     """How far the focal length, as a share of itself, may be off, or the marker's size: constant, considered."""
     image_shift_px: float = Field(default=0.0, ge=0)
     """How far all pictures may be shifted alike, by a principal point that is off: constant, considered."""
-    picture_shift_px: float = Field(default=0.01, ge=0)
-    """How far a whole picture may be shifted: vibration, a late stamp, what compression does to parallel edges."""
+    picture_shift_px: float = Field(default=0.003, ge=0)
+    """How far a whole picture may be shifted: more where the camera shakes or stamps are late."""
     initial_speed_m_s: float = Field(default=0.2, gt=0)
     initial_rate_rad_s: float = Field(default=0.2, gt=0)
-    gate_probability: float = Field(default=0.999999, gt=0.5, lt=1)
+    gate_probability: float = Field(default=0.999999999, gt=0.5, lt=1)
     """Share of true measurements that a gate lets through: layers whose sigma is half too small must pass it too."""
     ambiguity_ratio: float = Field(default=1e4, gt=1)
     """How many times likelier one of two poses must become before the other is dropped."""

@@ -15,8 +15,8 @@ from astratag.camera import Camera
 from astratag.geometry import LAYERS
 from astratag.transforms import inverse, transform
 from pipeline.convert import calibration_message, points_message, pose_message
-from pipeline.corners import SeenLayer, corner_noise, outward_shift
-from pipeline.lasting import CORNERS, OUTWARD
+from pipeline.corners import SeenLayer, corner_noise, edge_shifts, outward_shift
+from pipeline.lasting import EDGES, OUTWARD
 from pipeline.mission import CameraSection, CylinderSection, FlatSection, MarkerSection, Mission, PoseSection
 from pipeline.pose_filter import corners_on_target
 from pipeline.scenario import Approach, RelativeMotion
@@ -97,8 +97,8 @@ def detection(
     for (layer, corners), new_px in zip(layers.items(), noise_px, strict=True):
         off_px = bias_px * outward_shift(corners[None])[0] + new_px
         if lasting_px is not None:
-            off_px += lasting_px[layer][OUTWARD] * outward_shift(corners[None])[0]
-            off_px += lasting_px[layer][CORNERS].reshape(4, 2)
+            outside_px = lasting_px[layer][OUTWARD] + lasting_px[layer][EDGES]
+            off_px += np.tensordot(outside_px, edge_shifts(corners[None])[0], 1)
         measured.append(LayerCorners(layer=layer, corners_px=points_message(corners + off_px), sigma_px=sigma_px))
     return Detection(
         family="astratag20",

@@ -134,7 +134,7 @@ def test_accuracy_at_the_bound():
     """
     runs, frames, sigma_px, dt_s = 60, 30, 0.1, 1 / HZ
     mission_ = mission()
-    noise = mission_.filter.model_copy(update={"edge_bias_px": 0.0, "corner_bias_px": 0.0})
+    noise = mission_.filter.model_copy(update={"edge_bias_px": 0.0, "one_edge_bias_px": 0.0, "edge_turn_px": 0.0})
     eye = Eye(CAMERA, inverse(mission_.camera.T_chaser_cam.matrix()))
     points = [corners_on_target(mission_.markers[0], layer) for layer in (0, 1, 2)]
     T = truth(mission_, approach(0, tilt_rad=(0.2, -0.3, 0.1)).at(12.0)).T_a_b

@@ -14,7 +14,7 @@ from astratag.transforms import difference, exp_so3, inverse, pose, transform
 from nodes.bus import Received
 from nodes.step_host import StepWork
 from pipeline.convert import pose_matrix, pose_message, vector_array
-from pipeline.corners import Eye, SeenLayer, outward_shift, predicted_corners
+from pipeline.corners import Eye, SeenLayer, edge_shifts, outward_shift, predicted_corners
 from pipeline.dynamics import STATES, Motion
 from pipeline.hypotheses import mirrored_pose
 from pipeline.mission import FilterSection, FlatSection, Mission
@@ -104,13 +104,16 @@ def test_jacobian_against_finite_differences():
 
 
 def test_edge_bias_moves_every_edge_by_a_pixel():
-    """A quad whose corners shift by one unit of bias has each edge one pixel farther out."""
+    """A quad whose corners shift by one unit of bias has each edge one pixel farther out; or one edge, and no other."""
     quad = np.array([[10.0, 12], [90, 5], [100, 80], [5, 95]])
     shifted = quad + outward_shift(quad[None])[0]
     for k in range(4):
         along = (quad[(k + 1) % 4] - quad[k]) / np.linalg.norm(quad[(k + 1) % 4] - quad[k])
         outward = np.array([along[1], -along[0]])
         assert (shifted[[k, (k + 1) % 4]] - quad[k]) @ outward == pytest.approx([1, 1])
+        alone = quad + edge_shifts(quad[None])[0]
+        moved = [(alone[edge][[k, (k + 1) % 4]] - quad[k]) @ outward for edge in range(4)]
+        assert np.array(moved) == pytest.approx(np.outer(np.arange(4) == k, [1, 1]))
 
 
 def test_mirrored_pose_looks_the_same_from_afar():

@@ -84,7 +84,7 @@ WRONG = (
 def main() -> None:
     cv2.setNumThreads(1)
     parser = argparse.ArgumentParser(prog="python -m benchmarks.filter", description=__doc__)
-    parser.add_argument("--runs", type=int, default=20, help="of each approach")
+    parser.add_argument("--runs", type=int, default=48, help="of each approach")
     parser.add_argument("--branch-runs", type=int, default=100, help="of far, nearly frontal markers")
     parser.add_argument("--only", choices=("bound", "wrong", "branches"), help="one part of it")
     parser.add_argument("--seed", type=int, default=0, help="of the first run")
