@@ -258,9 +258,9 @@ def _followed(
     Return how many points it has, which may be more than there is room for, twice its area, and its straight and
     slanted steps.  ``marks`` and ``around`` are of all pixels; ``steps`` (8,) take from one to its neighbours.
     """
-    first, onwards = np.uint64(start), np.uint64(4)
-    if marks[first] == 0:
-        first, x, onwards = np.uint64(start - 1), x - 1, np.uint64(0)
+    of_hole = marks[start] == 0  # which begins at the paper after its ink
+    x -= of_hole
+    first, onwards = np.uint64(start - of_hole), np.uint64(0 if of_hole else 4)
     ring = np.uint64(around[first])
     if ring == 0:
         marks[first] |= SEEN + BEFORE_PAPER
@@ -271,25 +271,24 @@ def _followed(
             break
     second = np.uint64(np.int64(first) + steps[onwards])
     here, came_from, straight_on = first, onwards, onwards ^ np.uint64(4)
-    count, last = np.uint64(end), np.uint64(len(points) - 1)
-    doubled, taken, slanted = 0, 0, 0
+    count, last, doubled, taken, slanted = end, len(points) - 1, 0, 0, 0
     while True:
         turn = np.uint64(TURNS[np.uint64(around[here]) << np.uint64(3) | came_from])
         onwards = turn & np.uint64(7)
         marks[here] |= np.uint8(turn >> np.uint64(3))
-        at = min(count, last)
+        at = np.uint64(min(count, last))
         points[at, 0] = x - 1
         points[at, 1] = y - 1
-        count += np.uint64(onwards != straight_on)
+        count += 1 if onwards != straight_on else 0
         straight_on = onwards
         doubled += y * ACROSS[onwards] - x * DOWN[onwards]
-        slanted += np.int64(onwards & np.uint64(1))
+        slanted += 1 if onwards & np.uint64(1) else 0
         taken += 1
         x += ACROSS[onwards]
         y += DOWN[onwards]
         following = np.uint64(np.int64(here) + steps[onwards])
         if following == first and here == second:
-            return np.int64(count) - end, doubled, taken - slanted, slanted
+            return count - end, doubled, taken - slanted, slanted
         here, came_from = following, onwards ^ np.uint64(4)
 
 

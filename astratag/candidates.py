@@ -95,7 +95,7 @@ def flat_candidates(gray: Image, quads: Array, codebook: Codebook) -> list[Candi
         quads = quads[codebook.likeliest(sample(gray, points_in(quads, CELL_MIDDLES)), MAX_READ_FLAT)]
     sides_px = looks_large(quads)
     cells = cell_values(gray, points_in(quads, SAMPLES))
-    least = codebook.promising() + MORE_OF_SMALL * (blur_level(sides_px) > 0)
+    least = codebook.promising() + np.where(blur_level(sides_px) > 0, MORE_OF_SMALL, 0.0)
     best = codebook.best_readings(cells, least, MAX_CANDIDATES, sides_px)
     return [_turned(reading, quads[i]) for i, reading in best]
 

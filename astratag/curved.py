@@ -159,8 +159,8 @@ def curved_candidates(gray: Image, bent: Bent, codebook: Codebook, artwork: Artw
     if len(at) == 0:
         return []
     middles_px, facing = bent.seen(CELL_MIDDLES, at)
-    best = codebook.likeliest(_with_middle(sample(gray, middles_px), facing), MAX_READ)
-    at, facing = at[best], facing[best]
+    likeliest = codebook.likeliest(_with_middle(sample(gray, middles_px), facing), MAX_READ)
+    at, facing = at[likeliest], facing[likeliest]
     cells = _with_middle(cell_values(gray, bent.project(SAMPLES, at)), facing)
     corners_px = bent.project(OUTER, at)
     found: list[Candidate] = []

@@ -68,11 +68,18 @@ SIGMA_FLOOR_PX = 0.012
 """What a point's standard deviation never falls below: print, lens model, shape of the blur."""
 FINELY_SAMPLED_PX, COARSENESS = 64.0, 1.5
 """Prints that look larger are sampled so coarsely that this grows, by this power of their size."""
+MUCH_SLANTED = 2.0
+"""Prints seen at more than 60 degrees are off by more than the floor: measured, by the root of how much smaller they
+look one way.  A blur is not as round there as it is taken for."""
 LEAST_BLUR_PX, MOST_BLUR_PX = 0.5, 8.0
 HALF_UNIT = 0.5
 """How far derivatives by place reach, template units."""
 STEPS, SETTLED_PX = 6, 0.02
 FEWEST_POINTS = 60
+
+
+ASIDE = (1e-4, 2e-4)
+"""How far from a texel's centre it is looked what is there, so that no edge goes through: it would be no cell's."""
 
 
 def _labels() -> NDArray[np.uint8]:
@@ -83,15 +90,24 @@ def _labels() -> NDArray[np.uint8]:
     def fill(polygon: Array, label: int) -> None:
         at = polygon + OUTSIDE * TEMPLATE_UNITS
         low, high = np.floor(at.min(axis=0)).astype(int), np.ceil(at.max(axis=0)).astype(int)
-        x, y = np.meshgrid(*(np.arange(a, b) + 0.5 for a, b in zip(low, high, strict=True)))
+        x, y = np.meshgrid(*(np.arange(a, b) + 0.5 + aside for a, b, aside in zip(low, high, ASIDE, strict=True)))
         ahead = np.roll(at, -1, axis=0) - at
         sides = [dx * (y - y0) - dy * (x - x0) for (x0, y0), (dx, dy) in zip(at, ahead, strict=True)]
         inside = np.abs(np.sign(sides).sum(axis=0)) == len(at)
         picture[low[1] : high[1], low[0] : high[0]][inside] = label
 
+    def rounded(near: float, far: float, radius: float) -> None:
+        centre = np.arange(size) + 0.5 - OUTSIDE * TEMPLATE_UNITS
+        beyond = np.abs(centre - (near + far) / 2) - ((far - near) / 2 - radius)
+        across, down = np.maximum(beyond, 0.0), np.maximum(beyond, 0.0)[:, None]
+        picture[np.hypot(across, down) < radius] = WHITE
+
     margin = QUIET_MARGIN * TEMPLATE_UNITS
     for layer in LAYERS:
-        fill(square(*(layer.frame or (-margin, TEMPLATE_UNITS + margin))), WHITE)
+        if layer.frame is None:
+            fill(square(-margin, TEMPLATE_UNITS + margin), WHITE)
+        else:
+            rounded(*layer.frame, layer.frame_corner_radius)
         fill(square(*layer.black), BLACK)
         for label, cell in enumerate(cell_polygons() + DRAWN_OFFSET, start=FIRST_CELL):
             fill(layer_points(cell, layer), label)
@@ -277,7 +293,8 @@ class Alignment(Generic[W]):
     """A warp moved until the image looks as the print should.
 
     ``correlation`` is of the pixels with what they should be, light and its slope removed; ``covariance`` (P, P) is of
-    the warp's parameters, blur and light marginalised; ``moved_px`` how far the last step moved the print.
+    the warp's parameters, blur and light marginalised; ``moved_px`` how far the last step moved the print.  ``slant``
+    is how many times smaller the print looks one way than the other.
     """
 
     warp: W
@@ -285,6 +302,7 @@ class Alignment(Generic[W]):
     correlation: float
     covariance: Array
     moved_px: float
+    slant: float
 
     def sigma_px(self, template: Array) -> float:
         """Return what the standard deviation of each coordinate of points (N, 2) of the print amounts to.
@@ -303,8 +321,9 @@ class Alignment(Generic[W]):
         return float(np.einsum("nip,pq,niq->", J, self.covariance, J)) / len(self.covariance)
 
     def _floor_px(self) -> float:
-        """Return ``SIGMA_FLOOR_PX``, more where a print looks so large that its grid is coarse."""
-        return SIGMA_FLOOR_PX * max(1.0, _widest_px(self.warp) / FINELY_SAMPLED_PX) ** COARSENESS
+        """Return ``SIGMA_FLOOR_PX``, more where a print looks so large that its grid is coarse, or is much slanted."""
+        coarse = max(1.0, _widest_px(self.warp) / FINELY_SAMPLED_PX) ** COARSENESS
+        return SIGMA_FLOOR_PX * coarse * math.sqrt(max(1.0, self.slant / MUCH_SLANTED))
 
 
 @compiled(GRAY, MATRIX, CUBE, VECTOR, VECTOR, MATRIX)
@@ -413,7 +432,8 @@ class Synthesis:
                 return None
             warp = warp.stepped(x[:-1])
             blur_px = min(max(blur_px * math.exp(x[-1]), LEAST_BLUR_PX), MOST_BLUR_PX)
-            alignment = Alignment(warp, blur_px, correlation, covariance[:-1, :-1], moved_px)
+            fewest, most = seen.units
+            alignment = Alignment(warp, blur_px, correlation, covariance[:-1, :-1], moved_px, most / fewest)
             if moved_px < settled_px:
                 break
         return alignment

@@ -139,8 +139,8 @@ def test_blocks_are_told_apart_as_by_opencv(how, holes):
 @pytest.mark.parametrize("everywhere", [True, False], ids=["everywhere", "blocks"])
 @pytest.mark.parametrize("kind", ["noise", "blobs", "board", "JPEG", "squares"])
 def test_borders_are_followed_as_by_opencv(kind, everywhere):
-    gray, block_px = adversarial(kind), WIDTH if everywhere else 32
-    worth = np.random.default_rng(0).random((-(-HEIGHT // block_px), -(-WIDTH // block_px))) < (1 if everywhere else 0.5)
+    gray, block_px, share = adversarial(kind), WIDTH if everywhere else 32, 1.0 if everywhere else 0.5
+    worth = np.random.default_rng(0).random((-(-HEIGHT // block_px), -(-WIDTH // block_px))) < share
     shapes, _ = threshold_blocks(gray, sums_of(gray), worth, block_px, 7, 7, False)
     borders = cv2.findContours(shapes[1 : HEIGHT + 1, 1 : WIDTH + 1].copy(), cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)[0]
     long = [one for one in borders if len(one) >= 4 and cv2.arcLength(one, True) > 23.99]
