@@ -79,7 +79,9 @@ FEWEST_POINTS = 60
 
 
 ASIDE = (1e-4, 2e-4)
-"""How far from a texel's centre it is looked what is there, so that no edge goes through: it would be no cell's."""
+"""How far from a texel's centre, this way and that by turns, it is looked what is there: on an edge through centres,
+that neither side owns, half of the texels are the one side's and half the other's.
+"""
 
 
 def _labels() -> NDArray[np.uint8]:
@@ -90,7 +92,8 @@ def _labels() -> NDArray[np.uint8]:
     def fill(polygon: Array, label: int) -> None:
         at = polygon + OUTSIDE * TEMPLATE_UNITS
         low, high = np.floor(at.min(axis=0)).astype(int), np.ceil(at.max(axis=0)).astype(int)
-        x, y = np.meshgrid(*(np.arange(a, b) + 0.5 + aside for a, b, aside in zip(low, high, ASIDE, strict=True)))
+        x, y = np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True)))
+        x, y = x + 0.5 + ASIDE[0] * (1 - 2 * (y % 2)), y + 0.5 + ASIDE[1] * (1 - 2 * (x % 2))
         ahead = np.roll(at, -1, axis=0) - at
         sides = [dx * (y - y0) - dy * (x - x0) for (x0, y0), (dx, dy) in zip(at, ahead, strict=True)]
         inside = np.abs(np.sign(sides).sum(axis=0)) == len(at)
