@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from astratag.signature import BLUR_UNITS, BLURRED_CELLS, EFFECTIVE_SHARE
-from benchmarks.detection.cost import measure_cost
+from benchmarks.detection import clutter
+from benchmarks.detection.cost import SCENES, measure_cost
 from benchmarks.detection.false_accepts import measure_effective_cells, measure_false_accepts
 from benchmarks.detection.figures import draw_condition, draw_cost
 from benchmarks.detection.peers import ENTRANTS, MARKERS, TRACKED, Entrant, texture
@@ -63,6 +64,14 @@ def test_cost_of_two_frames(tmp_path):
     rows = measure_cost(2, (*QUICK, TRACKED))
     assert all(row["cpu_ms"] > 0 and row["found"] == 2 for row in rows)
     assert draw_cost(rows, tmp_path).stat().st_size > 0
+
+
+def test_pictures_without_a_marker_are_timed_beside_a_plain_one(monkeypatch):
+    monkeypatch.setattr(clutter, "SCENES", {"320x240": SCENES["320x240"]})
+    monkeypatch.setattr(clutter, "TURNS", 1)
+    for row in clutter.measure_clutter(QUICK[:1]):
+        assert row["plain_ms"] > 0 and row["median_times"] <= row["worst_times"]
+        assert row["worst"] in dict(clutter.clutter(draw(SCENES["320x240"], SEED)))
 
 
 def test_a_profile_divides_the_time_of_a_search():

@@ -10,12 +10,13 @@ import pytest
 
 from astratag import Camera, Cylinder, Detector, Flat, Surface, Tracker, load_dictionary
 from astratag.edges import inverse_transfer
-from astratag.geometry import square
+from astratag.geometry import QUIET_MARGIN, TEMPLATE_UNITS, square
 from astratag.matching import Match, acceptance_of_pixels, match, rough_matches
 from astratag.synthesis import Expected, Synthesis, _nodes, _picture, _weighted, expected, look
 from astratag.transforms import difference, exp_so3, perturb, pose
 from astratag.warp import FittedWarp, HomographyWarp, PoseWarp
 from pipeline.render import render_marker
+from pipeline.texture import print_coverage
 
 DICTIONARY = load_dictionary()
 SYNTHESIS = Synthesis(DICTIONARY)
@@ -83,6 +84,24 @@ def test_what_is_expected_is_the_mean_of_the_artwork_under_the_blur(
     many = looks(warp, BLUR_PX, softness=0.0)
     assert np.sqrt(np.mean((few.mean - many.mean) ** 2)) < 0.02
     assert np.abs(few.beyond - many.beyond).max() < 0.08
+
+
+@pytest.mark.parametrize("marker_id", [0, 3, 7])
+def test_the_artwork_is_what_is_printed(marker_id: int) -> None:
+    """As white in all, and nowhere shifted: texels on edges between cells are neither lost nor all the one side's."""
+    code = load_dictionary().signature(marker_id)
+    printed = print_coverage(code, texels_per_unit=2) / 255.0
+    inside = slice(round(2 * QUIET_MARGIN * TEMPLATE_UNITS), round(2 * (1 + QUIET_MARGIN) * TEMPLATE_UNITS))
+    printed = printed[inside, inside].reshape(round(TEMPLATE_UNITS), 2, round(TEMPLATE_UNITS), 2).mean(axis=(1, 3))
+    whole = _picture(code.tobytes(), 0.0).brightness
+    border = (len(whole) - len(printed)) // 2
+    seen = whole[border:-border, border:-border]
+    assert seen.mean() == pytest.approx(printed.mean(), abs=5e-4)
+    along = np.arange(len(seen)) + 0.5
+    for axis in (0, 1):
+        centres = [along @ picture.mean(axis=axis) / picture.mean() / len(seen) for picture in (seen, printed)]
+        assert centres[0] == pytest.approx(centres[1], abs=0.15)
+    assert np.abs(cv2.blur(seen - printed, (15, 15))).max() < 0.06
 
 
 def test_derivatives_are_differences() -> None:
