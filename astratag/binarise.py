@@ -41,7 +41,7 @@ INK, SEEN, BEFORE_PAPER = 1, 2, 4
 """What pixels of a shape are marked with, added up: on a border that was followed; on one with paper to its right."""
 WORD = 8
 """Pixels that are looked at at once: borders begin in few of them."""
-ALL_INK, ALL_BEFORE_PAPER = np.uint64(0x0101010101010101), np.uint64(0x0404040404040404)
+ALL_INK = np.uint64(0x0101010101010101)
 A_PIXEL, LAST_OF_WORD = np.uint64(8), np.uint64(56)
 """By how many bits a word is shifted to move its pixels on by one, and its last one to the front."""
 ROOM = 4096

@@ -114,6 +114,7 @@ class CylinderWarp:
 
 
 _STEP_SIGMA = np.append(np.full(6, np.inf), (CURVATURE_STEP, AXIS_STEP_RAD))
+_STEP_SIGMA.flags.writeable = False
 
 
 @compiled(MATRIX, MATRIX, VECTOR, REAL, REAL, REAL)

@@ -75,6 +75,7 @@ LEAST_BLUR_PX, MOST_BLUR_PX = 0.5, 8.0
 HALF_UNIT = 0.5
 """How far derivatives by place reach, template units."""
 STEPS, SETTLED_PX = 6, 0.02
+TINY = 1e-9
 FEWEST_POINTS = 60
 
 
@@ -435,8 +436,8 @@ class Synthesis:
                 return None
             warp = warp.stepped(x[:-1])
             blur_px = min(max(blur_px * math.exp(x[-1]), LEAST_BLUR_PX), MOST_BLUR_PX)
-            fewest, most = seen.units
-            alignment = Alignment(warp, blur_px, correlation, covariance[:-1, :-1], moved_px, most / fewest)
+            slant = seen.units[1] / max(seen.units[0], TINY)
+            alignment = Alignment(warp, blur_px, correlation, covariance[:-1, :-1], moved_px, slant)
             if moved_px < settled_px:
                 break
         return alignment
