@@ -299,7 +299,7 @@ def traced(shapes: Image, worth: Flags, block_px: int, least_px: float) -> tuple
     Shapes are of ``threshold_blocks``, and are marked in the course.  Borders shorter than ``least_px``, or with less
     than four points, are left out.  Suzuki and Abe, "Topological structural analysis of digitized binary images by
     border following", CVGIP 1985, without the hierarchy.  Where to turn is looked up, and where borders begin is seen
-    for eight pixels at once: branches that cannot be foreseen took nine tenths of the time.
+    for eight pixels at once: branches that cannot be foreseen took most of the time.
     """
     height, width = shapes.shape
     spans = _spans(worth, block_px, height - 2, width - 2)
