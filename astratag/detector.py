@@ -74,7 +74,7 @@ EVERY_WAY = (PLAIN, NARROW, FAINT)
 """Ways of telling ink from paper in which listed markers are looked for that were not found at once."""
 COVER_REACH_PX = 30_000
 """OpenCV draws no further."""
-MAX_READ_BY_PIXELS, MAX_MATCHED = 12, 2
+MAX_READ_BY_PIXELS, MAX_MATCHED = 8, 2
 """Squares in one image that are read by all their pixels; and that are aligned with a print.
 
 Of 58 markers found so each was the first to be aligned.
@@ -209,9 +209,9 @@ class Detector(Confirmer):
 
     def _search_bent_about(self, view: View, quads: Array) -> list[Detection]:
         """Return the markers among squares bent about cylinders whose corners are those of quads (Q, 4, 2)."""
-        if not self._bends:
-            return []
         quads = quads[looks_large(quads) >= LEAST_SIDE_PX]
+        if not self._bends or len(quads) == 0:
+            return []
         return self._search_curved(view, bent_through(view.some_camera, quads))
 
     def _search_very_bent(self, view: View) -> list[Detection]:
@@ -241,7 +241,7 @@ class Detector(Confirmer):
     def _search_pixels(self, view: View) -> list[Detection]:
         """Return the markers whose edges or cells cannot be followed, by all their pixels; see ``matching``.
 
-        Those in uneven light are read cell by cell; and bent squares that none was found through by then.
+        Before that, those in uneven light are read cell by cell, and those that seem bent as bent squares.
         """
         tried, left = np.zeros((0, 4, 2)), MAX_MATCHED
         for how in (TINY, SLANTED, BROAD, STEEP):
@@ -250,6 +250,9 @@ class Detector(Confirmer):
             if found:
                 return found
             fresh = first_distinct(framed(view.gray, quads), tried, MAX_READ_BY_PIXELS - len(tried))
+            found = self._search_bent_about(view, fresh)
+            if found:
+                return found
             fresh = fresh[: view.effort.afford(COST.by_pixels, len(fresh))]
             tried = np.concatenate([tried, fresh])
             rough = rough_matches(self._synthesis, view.lit, fresh, PIXEL_BLUR)[:left]
@@ -260,7 +263,7 @@ class Detector(Confirmer):
                 return found
             if left == 0:
                 break
-        return self._search_bent_about(view, tried)
+        return []
 
     @property
     def _bends(self) -> bool:
@@ -285,7 +288,7 @@ class Detector(Confirmer):
                 continue
             if candidate.side_px < LEAST_CLOSE_PX:
                 continue
-            by_edges = not candidate.bent and view.by_edges.take(candidate) and view.effort.spend(COST.edges)
+            by_edges = not candidate.bent and view.by_edges.take(candidate) and view.effort.begin(COST.edges)
             if not (by_edges and take(candidate, self._confirm_edges(view, candidate))):
                 left.append(candidate)
         for candidate in [] if _sure(found) or quick else left[:MAX_ALIGNED_AT_ONCE]:
@@ -293,7 +296,7 @@ class Detector(Confirmer):
             tries, units = (view.curved, COST.curved) if curved else (view.aligned, COST.aligned)
             if _inside_any(candidate.corners_px, found):
                 continue
-            if tries.take(candidate) and view.effort.spend(units):
+            if tries.take(candidate) and view.effort.begin(units):
                 take(candidate, self._confirm_aligned(view, candidate))
         return found + [seen for seen in surest(unmeasured) if not _inside_any(seen.corners_px, found)]
 

@@ -15,9 +15,9 @@ SAME_SQUARE = 0.04
 """Squares whose centres and sides differ by less than this fraction are one square found twice."""
 BETTER = 0.03
 """A square that was looked at is looked at again where it reads so much better."""
-LEAST_UNITS, UNITS_A_PIXEL, MOST_UNITS = 8_500, 0.057, 27_000
+LEAST_UNITS, UNITS_A_PIXEL, MOST_UNITS = 8_000, 0.053, 24_500
 """What one image is worth whatever its size, and more for each pixel, up to a limit: what the hardest markers of the
-benchmark take, which at 640x480 is 26 000.  A plain one with a marker takes about a thousand.
+benchmark take, which at 640x480 is 24 000.  A plain one with a marker takes about a thousand.
 
 A unit is what takes about a microsecond, counted and never measured, so that the same image always gets the same.
 """
@@ -32,14 +32,18 @@ class Effort:
 
     def spend(self, units: float) -> bool:
         """Return whether so many units are left, and spend them if so."""
-        if self.spent + units > self.most:
+        return self.spent + units <= self.most and self.begin(units)
+
+    def begin(self, units: float) -> bool:
+        """Return whether any units are left, and spend so many if so: what is promising is looked at to its end."""
+        if self.spent >= self.most:
             return False
         self.spent += units
         return True
 
     def afford(self, units: float, most: int) -> int:
         """Return how many things of so many units each can be done, ``most`` at most, and spend what they take."""
-        count = min(most, int((self.most - self.spent) / units))
+        count = max(0, min(most, int((self.most - self.spent) / units)))
         self.spent += count * units
         return count
 
@@ -50,24 +54,24 @@ class Costs:
 
     pixel: float = 0.0015
     """Of a picture in which outlines are looked for."""
-    resized_pixel: float = 0.0004
+    resized_pixel: float = 0.0002
     """More of the whole picture, at the resolution worked at."""
     border_pixel: float = 0.012
     """Of the borders of all shapes: followed, or looked through for near sides."""
     outline: float = 7.0
     """Simplified, and read as if flat."""
-    edges: float = 400.0
-    aligned: float = 1000.0
+    edges: float = 250.0
+    aligned: float = 1500.0
     bent: float = 0.9
     """A bent square whose frame is looked at."""
-    bent_read: float = 600.0
+    bent_read: float = 800.0
     """Those that have one, and how the best look."""
-    curved: float = 2300.0
-    relit: float = 18.0
+    curved: float = 3000.0
+    relit: float = 22.0
     """An outline read cell by cell."""
-    by_pixels: float = 500.0
+    by_pixels: float = 650.0
     matched: float = 2000.0
-    spline: float = 350.0
+    spline: float = 500.0
 
 
 COST = Costs()

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.binarise import NO_CONTOURS, Contours, sums_of, threshold_blocks, traced
+from astratag.binarise import NO_CONTOURS, Contours, sums_of, threshold_blocks, threshold_enlarged, traced
 from astratag.polygons import bent_quads, clockwise, convex_quads, uncut_quads
 
 Array = NDArray[np.float64]
@@ -137,18 +137,19 @@ class BentQuads(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scaled:
-    """An image at another resolution, and which blocks (R, C) of it outlines are looked for in; None is everywhere.
+    """An image made ready to be looked at in another resolution; one that is to be enlarged, as it is.
 
-    ``kept`` holds it smoothed over so many pixels, and its sums, for all that need them.
+    ``worth`` says in which of its blocks (R, C) outlines are looked for; None is everywhere.  ``kept`` holds it
+    smoothed over so many pixels, and its sums, for all that need them.
     """
 
     gray: Image
+    enlarged: int = 1
     worth: NDArray[np.bool_] | None = None
-    block_px: int = BLOCK_PX
     kept: dict[int, tuple[Image, NDArray[np.int32]]] = field(default_factory=dict)
 
     def smoothed(self, smooth_px: int) -> tuple[Image, NDArray[np.int32]]:
-        """Return the image averaged over so many pixels, and its sums."""
+        """Return the image averaged over so many of its pixels, and its sums."""
         if smooth_px not in self.kept:
             smooth = cv2.blur(self.gray, (smooth_px, smooth_px)) if smooth_px > 1 else self.gray
             self.kept[smooth_px] = smooth, sums_of(smooth)
@@ -159,21 +160,29 @@ class Scaled:
         """Return which blocks (R, C) are worth it, and how large they are: one for all where everything is."""
         if self.worth is None:
             return np.ones((1, 1), dtype=bool), max(self.gray.shape)
-        return self.worth, self.block_px
+        return self.worth, BLOCK_PX
 
     @property
     def looked_at_px(self) -> int:
-        """Return how many pixels are worth it, about."""
-        return self.gray.size if self.worth is None else int(self.worth.sum()) * self.block_px**2
+        """Return how many pixels are looked at, about, once it is enlarged."""
+        return self.enlarged**2 * (self.gray.size if self.worth is None else int(self.worth.sum()) * BLOCK_PX**2)
+
+    def shapes(self, how: Binarisation) -> tuple[Image, int]:
+        """Return 1 where there is ink, or white to look for holes in, and how often neighbours differ."""
+        smooth, sums = self.smoothed(how.smooth_px)
+        worth, block_px = self.blocks
+        if self.enlarged == 1:
+            return threshold_blocks(smooth, sums, worth, block_px, how.window_px, how.offset, how.holes)
+        near = cv2.dilate(worth.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+        window_px = how.window_px // self.enlarged // 2 * 2 + 1
+        return threshold_enlarged(smooth, sums, worth, near, block_px, window_px, how.offset, how.holes)
 
 
 def scaled(gray: Image, scale: float) -> Scaled:
-    """Return an image at another resolution; of one that is enlarged, only the best parts are worth looking at."""
-    if scale == 1.0:
-        return Scaled(gray)
-    interpolation = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    other = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=interpolation)
-    return Scaled(other, _worth_a_fine_look(gray) if scale > 1 else None, round(BLOCK_PX * scale))
+    """Return an image to be looked at in another resolution; of one twice as large, only the best parts are worth it."""
+    if scale > 1:
+        return Scaled(gray, round(scale), _worth_a_fine_look(gray))
+    return Scaled(gray if scale == 1 else cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
 
 
 def find_outlines(gray: Image, how: Binarisation = PLAIN, image: Scaled | None = None) -> Outlines:
@@ -182,21 +191,23 @@ def find_outlines(gray: Image, how: Binarisation = PLAIN, image: Scaled | None =
     ``image`` is what ``scaled`` makes of the gray one, if that is known.
     """
     image = image or scaled(gray, how.scale)
-    smooth, sums = image.smoothed(how.smooth_px)
-    worth, block_px = image.blocks
-    shapes, changes = threshold_blocks(smooth, sums, worth, block_px, how.window_px, how.offset, how.holes)
+    shapes, changes = image.shapes(how)
     contours, followed = NO_CONTOURS, 0
     if how.scale * changes <= NOISE * image.looked_at_px:  # else thousands of contours, and none of them a square
-        points, starts, areas, perimeters, followed = traced(shapes, worth, block_px, MIN_PERIMETER_PX)
+        worth, block_px = image.blocks
+        points, starts, areas, perimeters, followed = traced(
+            shapes, worth, image.enlarged * block_px, MIN_PERIMETER_PX
+        )
         contours = Contours(points, starts, areas, perimeters)
     if how.holes:
         contours = contours.run_backwards()
+    height, width = image.gray.shape
     return Outlines(
         contours=_plausible(contours),
         scale=1 / how.scale,
         origin=np.zeros(2),
         outset_px=INSET_PX if how.holes else OUTSET_PX,
-        size=(smooth.shape[1], smooth.shape[0]),
+        size=(image.enlarged * width, image.enlarged * height),
         others=contours,
         followed=followed,
     )

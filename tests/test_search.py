@@ -13,12 +13,12 @@ import pytest
 import astratag.confirm
 import astratag.detector
 from astratag import Camera, Detector, Flat, load_dictionary
-from astratag.binarise import sums_of, threshold_blocks, traced
+from astratag.binarise import sums_of, threshold_blocks, threshold_enlarged, traced
 from astratag.candidates import Candidate
 from astratag.codes import Reading
 from astratag.describe import outer_corners
 from astratag.detector import MAX_MATCHED
-from astratag.effort import BETTER, LEAST_UNITS, MOST_UNITS, UNITS_A_PIXEL, Effort, Tries, first_distinct
+from astratag.effort import BETTER, COST, LEAST_UNITS, MOST_UNITS, UNITS_A_PIXEL, Effort, Tries, first_distinct
 from astratag.geometry import LAYERS, TEMPLATE_UNITS, square
 from astratag.polygons import hull, simplified
 from astratag.search import (
@@ -114,7 +114,7 @@ def test_only_the_largest_steps_are_worth_a_fine_look():
     image[::32, ::32] = 150
     image[300:314, 700:714] = 10
     enlarged = scaled(image, 2.0)
-    assert enlarged.gray.shape == (1440, 2560) and enlarged.block_px == 2 * BLOCK_PX
+    assert enlarged.gray is image and enlarged.enlarged == 2
     assert enlarged.worth is not None and enlarged.worth.shape == (45, 80)
     assert enlarged.worth.sum() * BLOCK_PX**2 <= FINE_PX
     assert enlarged.worth[300 // BLOCK_PX : 314 // BLOCK_PX + 1, 700 // BLOCK_PX : 714 // BLOCK_PX + 1].all()
@@ -134,6 +134,25 @@ def test_blocks_are_told_apart_as_by_opencv(how, holes):
     np.testing.assert_array_equal(shapes[1:251, 1:334], expected)
     assert shapes.sum() == expected.sum()
     assert changes == np.abs(np.diff(expected.astype(int), axis=1)).sum()
+
+
+@pytest.mark.parametrize("holes", [True, False])
+@pytest.mark.parametrize("window_px", [5, 11, 15])
+def test_what_is_told_apart_enlarged_is_what_stands_out_enlarged(window_px, holes):
+    """As by OpenCV's resizing of how far every pixel is above the mean around it."""
+    rng = np.random.default_rng(0)
+    gray = cv2.resize(rng.integers(0, 256, (40, 50), dtype=np.uint8), (133, 90), interpolation=cv2.INTER_CUBIC)
+    worth = rng.random((6, 9)) < 0.5
+    near = cv2.dilate(worth.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    area, offset = window_px**2, 7
+    total = cv2.boxFilter(gray, cv2.CV_64F, (window_px,) * 2, normalize=False, borderType=cv2.BORDER_REPLICATE)
+    stands_out = cv2.resize(gray * float(area) - total, None, fx=2, fy=2, interpolation=cv2.INTER_LINEAR)
+    inside = np.kron(worth, np.ones((32, 32), dtype=bool))[: len(stands_out), : stands_out.shape[1]]
+    expected = inside & (stands_out > offset * area if holes else -stands_out > offset * area)
+    shapes, changes = threshold_enlarged(gray, sums_of(gray), worth, near, 16, window_px, offset, holes)
+    np.testing.assert_array_equal(shapes[1:181, 1:267], expected)
+    assert shapes.sum() == expected.sum() > 0
+    assert changes <= np.abs(np.diff(expected.astype(int), axis=1)).sum()
 
 
 @pytest.mark.parametrize("everywhere", [True, False], ids=["everywhere", "blocks"])
@@ -260,7 +279,7 @@ def test_no_image_is_looked_at_closely_more_often_than_bounded(kind, surface, mo
         adversarial(kind), Camera([[300, 0, 160], [0, 300, 120], [0, 0, 1]], width=WIDTH, height=HEIGHT)
     )
     assert detector.find(view) == []
-    assert view.effort.spent <= view.effort.most
+    assert view.effort.spent <= view.effort.most + COST.curved
     assert len(view.by_edges.made) <= MAX_BY_EDGES and len(view.aligned.made) <= MAX_ALIGNED
     assert len(view.curved.made) <= MAX_CURVED
     assert counts["match"] <= MAX_MATCHED and counts["find_outlines"] <= len(EVERY_BINARISATION)
@@ -281,7 +300,7 @@ def test_what_is_done_ends_with_the_effort_an_image_is_worth(kind, monkeypatch):
             view = detector.view(adversarial(kind), camera)
             view.effort.most = most
             assert detector.find(view) == []
-        assert view.effort.spent <= most
+        assert view.effort.spent <= most + COST.curved * (most > 0)  # what was begun is ended
         calls.append(counts)
     assert calls[0]["find_outlines"] == calls[0]["curved_candidates"] == 0
     assert calls[0]["find_outlines"] <= calls[1]["find_outlines"] <= calls[2]["find_outlines"]
@@ -294,10 +313,15 @@ def test_no_image_of_any_size_is_worth_more_than_so_many_units(kind, size):
     detector = Detector()
     view = detector.view(image, None)
     assert detector.find(view) == []
-    assert view.effort.spent <= view.effort.most <= min(LEAST_UNITS + UNITS_A_PIXEL * image.size, MOST_UNITS)
+    assert view.effort.spent <= view.effort.most + COST.curved
+    assert view.effort.most <= min(LEAST_UNITS + UNITS_A_PIXEL * image.size, MOST_UNITS)
 
 
-def test_effort_is_never_overspent():
+def test_effort_is_never_overspent_but_by_what_was_begun():
+    effort = Effort(1000)
+    assert effort.spend(effort.most - 1) and not effort.spend(2.0)
+    assert effort.begin(2.0) and effort.spent == effort.most + 1 and not effort.begin(2.0)
+    assert effort.afford(5.0, 3) == 0
     effort = Effort(1000)
     assert effort.spend(effort.most) and not effort.spend(1.0)
     assert effort.afford(5.0, 3) == 0
