@@ -179,7 +179,7 @@ class Scaled:
 
 
 def scaled(gray: Image, scale: float) -> Scaled:
-    """Return an image to be looked at in another resolution; of one twice as large, only the best parts are worth it."""
+    """Return an image to be looked at in another resolution; of one to be enlarged, only its best parts are worth it."""
     if scale > 1:
         return Scaled(gray, round(scale), _worth_a_fine_look(gray))
     return Scaled(gray if scale == 1 else cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
