@@ -179,7 +179,7 @@ class Scaled:
 
 
 def scaled(gray: Image, scale: float) -> Scaled:
-    """Return an image to be looked at in another resolution; of one to be enlarged, only its best parts are worth it."""
+    """Return an image to be looked at in another resolution; of an enlarged one, only the best parts are worth it."""
     if scale > 1:
         return Scaled(gray, round(scale), _worth_a_fine_look(gray))
     return Scaled(gray if scale == 1 else cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
@@ -195,9 +195,7 @@ def find_outlines(gray: Image, how: Binarisation = PLAIN, image: Scaled | None =
     contours, followed = NO_CONTOURS, 0
     if how.scale * changes <= NOISE * image.looked_at_px:  # else thousands of contours, and none of them a square
         worth, block_px = image.blocks
-        points, starts, areas, perimeters, followed = traced(
-            shapes, worth, image.enlarged * block_px, MIN_PERIMETER_PX
-        )
+        points, starts, areas, perimeters, followed = traced(shapes, worth, image.enlarged * block_px, MIN_PERIMETER_PX)
         contours = Contours(points, starts, areas, perimeters)
     if how.holes:
         contours = contours.run_backwards()
