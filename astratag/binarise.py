@@ -207,39 +207,37 @@ def threshold_enlarged(
 ) -> tuple[Image, int]:
     """Return what ``threshold_blocks`` does of an image (H, W) twice as large, interpolated, that is never made.
 
-    How far a pixel is above its mean is known in the image itself, and as smooth as that: so that is enlarged, and
+    How far a pixel stands out from the mean around it is as smooth as the image itself: so that is interpolated, and
     only in blocks that are ``worth`` it.  ``near`` are these and the blocks around them.  Windows and blocks are in the
     image's own pixels.
     """
     height, width = gray.shape
     shapes = np.zeros((2 * height + 2, -(-(2 * width + 2) // WORD) * WORD), dtype=np.uint8)
-    above_mean = np.zeros((height + 2, width + 2), dtype=np.float32)
+    stands_out = np.zeros((height + 2, width + 2), dtype=np.float32)
     reach, changes = window_px // 2, 0
     area = np.float32(window_px * window_px)
-    apart = np.float32(offset) * area * np.float32(1 if holes else -1)
+    apart, sign = np.float32(offset) * area, np.float32(1 if holes else -1)
     for y, first, stop in _spans(near, block_px, height, width):
         left, count = first - 1, stop - first
         before, after = left + MOST_REACH_PX - reach, left + MOST_REACH_PX + reach + 1
         above, below = sums[y - 1 + MOST_REACH_PX - reach], sums[y + MOST_REACH_PX + reach]
         a, b = above[before : before + count], above[after : after + count]
         c, d = below[before : before + count], below[after : after + count]
-        level, row = gray[y - 1, left:], above_mean[y, first:stop]
+        level, row = gray[y - 1, left:], stands_out[y, first:stop]
         for x in range(count):
-            row[x] = np.float32(level[x]) * area - apart - np.float32(np.int32(d[x] - c[x] - b[x] + a[x]))
-    above_mean[0], above_mean[height + 1] = above_mean[1], above_mean[height]
-    above_mean[:, 0], above_mean[:, width + 1] = above_mean[:, 1], above_mean[:, width]
+            total = np.float32(np.int32(d[x] - c[x] - b[x] + a[x]))
+            row[x] = sign * (np.float32(level[x]) * area - total) - apart
+    stands_out[0], stands_out[height + 1] = stands_out[1], stands_out[height]
+    stands_out[:, 0], stands_out[:, width + 1] = stands_out[:, 1], stands_out[:, width]
     quarter, rest = np.float32(0.25), np.float32(0.75)
     between = np.empty(width + 2, dtype=np.float32)
     for y, first, stop in _spans(worth, block_px, height, width):
         count = stop - first
         for half in range(2):
-            here, beside = above_mean[y, first - 1 :], above_mean[y - 1 + 2 * half, first - 1 :]
+            here, beside = stands_out[y, first - 1 :], stands_out[y - 1 + 2 * half, first - 1 :]
             shape = shapes[2 * y - 1 + half, 2 * first - 1 :]
             for x in range(count + 2):
                 between[x] = rest * here[x] + quarter * beside[x]
-            if not holes:
-                for x in range(count + 2):
-                    between[x] = -between[x]
             for x in range(count):
                 shape[2 * x] = rest * between[x + 1] + quarter * between[x] > 0
                 shape[2 * x + 1] = rest * between[x + 1] + quarter * between[x + 2] > 0

@@ -253,8 +253,8 @@ class Detector(Confirmer):
             found = self._search_bent_about(view, fresh)
             if found:
                 return found
-            fresh = fresh[: view.effort.afford(COST.by_pixels, len(fresh))]
             tried = np.concatenate([tried, fresh])
+            fresh = fresh[: view.effort.afford(COST.by_pixels, len(fresh))]
             rough = rough_matches(self._synthesis, view.lit, fresh, PIXEL_BLUR)[:left]
             rough = rough[: view.effort.afford(COST.matched, len(rough))]
             left -= len(rough)
