@@ -96,9 +96,10 @@ def _solution(columns: Array, value: Array, weight: Array, step_sigma: Array, si
     """
     size = len(columns)
     normal, right, scale = gram(columns * np.sqrt(weight)), np.empty(size), np.empty(size)
+    weighted = weight * value
     for i in range(size):
         scale[i] = math.sqrt(dot(columns[i], columns[i])) + 1e-12
-        right[i] = dot(columns[i], weight * value) / scale[i]
+        right[i] = dot(columns[i], weighted) / scale[i]
     for i in range(size):
         for j in range(size):
             normal[i, j] /= scale[i] * scale[j]

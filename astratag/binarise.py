@@ -208,12 +208,13 @@ def threshold_enlarged(
     """Return what ``threshold_blocks`` does of an image (H, W) twice as large, interpolated, that is never made.
 
     How far a pixel stands out from the mean around it is as smooth as the image itself: so that is interpolated, and
-    only in blocks that are ``worth`` it.  ``near`` are these and the blocks around them.  Windows and blocks are in the
-    image's own pixels.
+    only in blocks that are ``worth`` it.  ``near`` are these and the blocks around them: what lies beyond is left
+    undefined, for clearing it took longer than what is looked at.  Windows and blocks are in the image's own pixels.
     """
     height, width = gray.shape
-    shapes = np.zeros((2 * height + 2, -(-(2 * width + 2) // WORD) * WORD), dtype=np.uint8)
-    stands_out = np.zeros((height + 2, width + 2), dtype=np.float32)
+    shapes = np.empty((2 * height + 2, -(-(2 * width + 2) // WORD) * WORD), dtype=np.uint8)
+    shapes[0], shapes[2 * height + 1], shapes[:, 0], shapes[:, 2 * width + 1 :] = 0, 0, 0, 0
+    stands_out = np.empty((height + 2, width + 2), dtype=np.float32)
     reach, changes = window_px // 2, 0
     area = np.float32(window_px * window_px)
     apart, sign = np.float32(offset) * area, np.float32(1 if holes else -1)
@@ -227,6 +228,7 @@ def threshold_enlarged(
         for x in range(count):
             total = np.float32(np.int32(d[x] - c[x] - b[x] + a[x]))
             row[x] = sign * (np.float32(level[x]) * area - total) - apart
+        shapes[2 * y - 1 : 2 * y + 1, 2 * first - 1 : 2 * stop - 1] = 0
     stands_out[0], stands_out[height + 1] = stands_out[1], stands_out[height]
     stands_out[:, 0], stands_out[:, width + 1] = stands_out[:, 1], stands_out[:, width]
     quarter, rest = np.float32(0.25), np.float32(0.75)

@@ -20,7 +20,7 @@ from astratag.compiled import CUBE, INT, MATRIX, REAL, VECTOR, array, compiled
 from astratag.geometry import TEMPLATE_UNITS, print_from_template, square
 from astratag.surface import Cylinder
 from astratag.transforms import pose
-from astratag.warp import GRAZING_COSINE, PoseWarp, slopes_of
+from astratag.warp import GRAZING_COSINE, NEAREST_SIDES, OUTSIDE_PX, PoseWarp, in_camera, slopes_of
 
 Array = NDArray[np.float64]
 
@@ -64,20 +64,13 @@ class CylinderWarp:
 
     def __call__(self, template: Array) -> Array:
         """Return pixels (..., 2)."""
-        return self.pose(template)
+        return self._seen(template)[0].reshape(np.shape(template))
 
     def jacobian(self, template: Array) -> Array:
         """Return the derivative (N, 2, 8): the pose's six, then curvature and axis."""
-        surface, on_print = self.surface, print_from_template(np.ascontiguousarray(template), self.pose.side_m)
-        extra = _by_surface(
-            on_print,
-            self.pose.T_cam_marker,
-            self.pose.camera.lens,
-            surface.radius_m,
-            surface.axis_rad,
-            self.pose.side_m,
-        )
-        return np.concatenate([self.pose.jacobian(template), extra], axis=2)
+        surface, pose = self.surface, self.pose
+        on_print = print_from_template(np.ascontiguousarray(template), pose.side_m)
+        return _jacobian(on_print, pose.T_cam_marker, pose.camera.lens, surface.radius_m, surface.axis_rad, pose.side_m)
 
     def slopes(self, template: Array, along: Array) -> Array:
         """Return the derivative (8, N) along unit vectors (2, N)."""
@@ -91,7 +84,16 @@ class CylinderWarp:
 
     def visible(self, template: Array) -> NDArray[np.bool_]:
         """Return which points face the camera by more than a grazing angle."""
-        return self.pose.visible(template)
+        return self._seen(template)[1]
+
+    def _seen(self, template: Array) -> tuple[Array, NDArray[np.bool_]]:
+        surface, pose = self.surface, self.pose
+        on_print, nearest_m = (
+            print_from_template(np.reshape(template, (-1, 2)), pose.side_m),
+            NEAREST_SIDES * pose.side_m,
+        )
+        lens = pose.camera.lens
+        return _seen_on_cylinder(on_print, pose.T_cam_marker, lens, surface.radius_m, surface.axis_rad, nearest_m)
 
     def step_sigma(self) -> Array:
         """Return limits (8,) on curvature and axis only."""
@@ -118,13 +120,45 @@ _STEP_SIGMA.flags.writeable = False
 
 
 @compiled(MATRIX, MATRIX, VECTOR, REAL, REAL, REAL)
-def _by_surface(
+def _seen_on_cylinder(
+    on_print: Array, T_cam_marker: Array, lens: Array, radius_m: float, axis_rad: float, nearest_m: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the pixels (N, 2) of print points (N, 2) on a cylinder, and which (N,) face the viewer.
+
+    As ``PoseWarp`` does, which keeps where they are on a surface; an unknown cylinder is another with every step.
+    """
+    R, c, s = T_cam_marker, math.cos(axis_rad), math.sin(axis_rad)
+    at, facing = np.empty((len(on_print), 2)), np.empty(len(on_print), dtype=np.bool_)
+    for i in range(len(on_print)):
+        x, y = on_print[i, 0], on_print[i, 1]
+        angle = (c * y - s * x) / radius_m
+        sine, cosine = math.sin(angle), math.cos(angle)
+        along, across = c * x + s * y, radius_m * sine
+        X, Y, Z = in_camera(R, c * along - s * across, s * along + c * across, radius_m * (cosine - 1))
+        p, q = -s * sine, c * sine
+        towards = -(
+            X * (R[0, 0] * p + R[0, 1] * q + R[0, 2] * cosine)
+            + Y * (R[1, 0] * p + R[1, 1] * q + R[1, 2] * cosine)
+            + Z * (R[2, 0] * p + R[2, 1] * q + R[2, 2] * cosine)
+        )
+        facing[i] = towards > GRAZING_COSINE * math.sqrt(X * X + Y * Y + Z * Z) and Z > 0
+        before = nearest_m < Z
+        u, v = pixel(X, Y, Z if before else 1.0, lens)
+        at[i, 0], at[i, 1] = u if before else OUTSIDE_PX, v if before else OUTSIDE_PX
+    return at, facing
+
+
+@compiled(MATRIX, MATRIX, VECTOR, REAL, REAL, REAL)
+def _jacobian(
     on_print: Array, T_cam_marker: Array, lens: Array, radius_m: float, axis_rad: float, side_m: float
 ) -> Array:
-    """Return how the pixels of print points (N, 2) move with the cylinder's curvature and axis (N, 2, 2)."""
+    """Return how the pixels of print points (N, 2) move (N, 2, 8) with the pose, and the cylinder's curvature and axis.
+
+    The pose is perturbed from the right, as by ``pose_jacobian``.
+    """
     T, c, s = T_cam_marker, math.cos(axis_rad), math.sin(axis_rad)
     radius_step = -(radius_m**2) / side_m  # d radius / d curvature
-    J = np.empty((len(on_print), 2, 2))
+    J = np.empty((len(on_print), 2, 8))
     for i in range(len(on_print)):
         x, y = on_print[i, 0], on_print[i, 1]
         a, b = c * x + s * y, c * y - s * x  # along the axis, and across it
@@ -143,7 +177,10 @@ def _by_surface(
             wx = T[0, 0] * gx + T[1, 0] * gy + T[2, 0] * gz
             wy = T[0, 1] * gx + T[1, 1] * gy + T[2, 1] * gz
             wz = T[0, 2] * gx + T[1, 2] * gy + T[2, 2] * gz
-            J[i, axis, 0], J[i, axis, 1] = ux * wx + uy * wy + uz * wz, vx * wx + vy * wy + vz * wz
+            J[i, axis, 0], J[i, axis, 1], J[i, axis, 2] = wx, wy, wz
+            J[i, axis, 3], J[i, axis, 4] = py * wz - inward * wy, inward * wx - px * wz
+            J[i, axis, 5] = px * wy - py * wx
+            J[i, axis, 6], J[i, axis, 7] = ux * wx + uy * wy + uz * wz, vx * wx + vy * wy + vz * wz
     return J
 
 

@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 from astratag.camera import Camera
 from astratag.candidates import (
     MAX_BENT_READ,
-    MAX_RELIT_READ,
     SURE,
     Candidate,
     bent_candidates,
     flat_candidates,
     framed,
     looks_large,
+    promise_of,
+    relightable,
     relit_candidates,
 )
 from astratag.checks import instance
@@ -44,6 +45,7 @@ from astratag.search import (
     COARSE,
     FAINT,
     FINE_PX,
+    MAX_BENT_OUTLINES,
     NARROW,
     NONE,
     PLAIN,
@@ -149,7 +151,11 @@ class Detector(Confirmer):
             if found:
                 break
         return (
-            surest(found) or self._search_very_bent(view) or self._search_pixels(view) or self._search_by_spline(view)
+            surest(found)
+            or self._search_very_bent(view)
+            or self._search_pixels(view)
+            or self.search_later(view)
+            or self._search_by_spline(view)
         )
 
     def find_missing(
@@ -161,14 +167,16 @@ class Detector(Confirmer):
         listed are worth another look where nothing is found yet, and nothing else is taken from it.
         """
         found = list(found)
-        effort = Effort(view.gray.size)  # of its own: what was found at once took little, and is worth the rest
+        effort = Effort(
+            view.gray.size, flat=not self._bends
+        )  # of its own: what was found at once took little, and is worth the rest
         for how in ways if found else ():
             missing = set(self.markers) - {seen.marker_id for seen in found}
             if not missing:
                 break
-            rest = replace(view, gray=_covered(view.gray, found), effort=effort, scaled={}, outlines={})
+            rest = replace(view, gray=_covered(view.gray, found), effort=effort, later=[], scaled={}, outlines={})
             outlines = _outlines(rest, how)
-            others = [*self.search(rest, outlines), *self._search_bent(rest, outlines)]
+            others = [*self.search(rest, outlines), *self._search_bent(rest, outlines), *self.search_later(rest)]
             found = surest([seen for seen in others if seen.marker_id in missing], first=found)
         return found
 
@@ -186,7 +194,7 @@ class Detector(Confirmer):
             camera.require_size(gray.shape[1], gray.shape[0])
         if self._lit.shape != gray.shape:
             self._lit = np.zeros(gray.shape, dtype=np.float32)
-        return View(gray, Light(gray, self._of_gray), camera, Effort(gray.size), self._lit, boxes)
+        return View(gray, Light(gray, self._of_gray), camera, Effort(gray.size, flat=not self._bends), self._lit, boxes)
 
     def search(self, view: View, outlines: Outlines, *, whole: bool = False) -> list[Detection]:
         """Return the markers among outlines read as if flat, each once, the surest first; see ``quads_of``."""
@@ -195,15 +203,17 @@ class Detector(Confirmer):
 
     def _search_relit(self, view: View, quads: Array) -> list[Detection]:
         """Return the markers among quads (Q, 4, 2) in glare, hard shadow or half covered."""
-        if self._codebook.tau_hamming is not None or not view.effort.spend(
-            COST.relit * min(len(quads), MAX_RELIT_READ)
-        ):
+        if self._codebook.tau_hamming is not None:
             return []
-        return surest(self._confirm_all(view, relit_candidates(view.gray, view.lit, quads, self._codebook)))
+        quads = relightable(view.gray, quads)
+        quads = quads[: view.effort.afford(COST.relit, len(quads))]
+        return surest(self._confirm_all(view, relit_candidates(view.lit, quads, self._codebook)))
 
     def _search_bent(self, view: View, outlines: Outlines) -> list[Detection]:
         """Return the markers among outlines bent about cylinders, none when every marker is on a plane."""
         if not self._bends:
+            return []
+        if not view.effort.spend(COST.outline * min(outlines.contours.count, MAX_BENT_OUTLINES)):
             return []
         return self._search_bent_about(view, np.concatenate([quads_of(outlines), bent_quads_of(outlines).corners_px]))
 
@@ -256,7 +266,7 @@ class Detector(Confirmer):
             tried = np.concatenate([tried, fresh])
             fresh = fresh[: view.effort.afford(COST.by_pixels, len(fresh))]
             rough = rough_matches(self._synthesis, view.lit, fresh, PIXEL_BLUR)[:left]
-            rough = rough[: view.effort.afford(COST.matched, len(rough))]
+            rough = [one for one in rough if view.effort.begin(COST.matched)]
             left -= len(rough)
             found = [seen for seen in (self._confirm_pixels(view, one) for one in rough) if seen is not None]
             if found:
@@ -292,13 +302,28 @@ class Detector(Confirmer):
             if not (by_edges and take(candidate, self._confirm_edges(view, candidate))):
                 left.append(candidate)
         for candidate in [] if _sure(found) or quick else left[:MAX_ALIGNED_AT_ONCE]:
-            curved = isinstance(candidate.warp, CylinderWarp)
-            tries, units = (view.curved, COST.curved) if curved else (view.aligned, COST.aligned)
             if _inside_any(candidate.corners_px, found):
                 continue
-            if tries.take(candidate) and view.effort.begin(units):
-                take(candidate, self._confirm_aligned(view, candidate))
+            promise = promise_of(view.gray, candidate, self._codebook, self._artwork)
+            if promise is not None and promise >= 0:
+                take(candidate, self._move(view, candidate))
+            elif promise is not None:
+                view.later.append(replace(candidate, promise=promise))
         return found + [seen for seen in surest(unmeasured) if not _inside_any(seen.corners_px, found)]
+
+    def _move(self, view: View, candidate: Candidate) -> Detection | None:
+        """Return the marker a candidate is once aligned, None when it is none, or enough were tried."""
+        curved = isinstance(candidate.warp, CylinderWarp)
+        tries, units = (view.curved, COST.curved) if curved else (view.aligned, COST.aligned)
+        spend = view.effort.begin if candidate.promise >= 0 else view.effort.spend
+        return self._confirm_aligned(view, candidate) if tries.take(candidate) and spend(units) else None
+
+    def search_later(self, view: View) -> list[Detection]:
+        """Return the first marker among the candidates that were not promising enough at once, the best first."""
+        best = sorted(view.later, key=lambda candidate: -candidate.promise)
+        found = (self._move(view, candidate) for candidate in best)
+        first = next((seen for seen in found if seen is not None), None)
+        return [] if first is None else [first]
 
 
 def _outlines(view: View, how: Binarisation) -> Outlines:
@@ -307,7 +332,7 @@ def _outlines(view: View, how: Binarisation) -> Outlines:
         return view.outlines[how]
     enlarged = how.scale**2 * view.gray.size
     looked_at = min(enlarged, how.scale**2 * FINE_PX) if how.scale > 1 else enlarged
-    if not view.effort.spend(COST.pixel * looked_at + COST.resized_pixel * enlarged):
+    if not view.effort.spend(COST.look + COST.pixel * looked_at + COST.resized_pixel * enlarged):
         return NONE
     if how.scale not in view.scaled:
         view.scaled[how.scale] = scaled(view.gray, how.scale)

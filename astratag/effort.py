@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.candidates import Candidate, looks_large
+from astratag.candidates import Candidate, side_of
+from astratag.compiled import CUBE, INT, MATRIX, compiled
 
 Array = NDArray[np.float64]
 
@@ -15,9 +16,10 @@ SAME_SQUARE = 0.04
 """Squares whose centres and sides differ by less than this fraction are one square found twice."""
 BETTER = 0.03
 """A square that was looked at is looked at again where it reads so much better."""
-LEAST_UNITS, UNITS_A_PIXEL, MOST_UNITS = 8_000, 0.053, 24_500
+LEAST_UNITS, UNITS_A_PIXEL, MOST_UNITS, SHARE_OF_FLAT = 8_000, 0.026, 18_000, 0.72
 """What one image is worth whatever its size, and more for each pixel, up to a limit: what the hardest markers of the
-benchmark take, which at 640x480 is 24 000.  A plain one with a marker takes about a thousand.
+benchmark take, which at 640x480 is 16 000; and the share of that where every marker is known to be flat.  A plain one
+with a marker takes about a thousand.
 
 A unit is what takes about a microsecond, counted and never measured, so that the same image always gets the same.
 """
@@ -26,8 +28,8 @@ A unit is what takes about a microsecond, counted and never measured, so that th
 class Effort:
     """How many units of effort an image is worth, and how many were spent on it."""
 
-    def __init__(self, pixels: int) -> None:
-        self.most = min(LEAST_UNITS + UNITS_A_PIXEL * pixels, MOST_UNITS)
+    def __init__(self, pixels: int, *, flat: bool = False) -> None:
+        self.most = min(LEAST_UNITS + UNITS_A_PIXEL * pixels, MOST_UNITS) * (SHARE_OF_FLAT if flat else 1.0)
         self.spent = 0.0
 
     def spend(self, units: float) -> bool:
@@ -52,26 +54,28 @@ class Effort:
 class Costs:
     """What is done in an image, in units."""
 
-    pixel: float = 0.0015
+    look: float = 300.0
+    """One way of telling ink from paper, however small the picture."""
+    pixel: float = 0.0017
     """Of a picture in which outlines are looked for."""
     resized_pixel: float = 0.0002
     """More of the whole picture, at the resolution worked at."""
     border_pixel: float = 0.012
     """Of the borders of all shapes: followed, or looked through for near sides."""
-    outline: float = 7.0
-    """Simplified, and read as if flat."""
-    edges: float = 250.0
+    outline: float = 5.0
+    """Simplified, and read as if flat; or simplified as if bent."""
+    edges: float = 150.0
     aligned: float = 1500.0
-    bent: float = 0.9
+    bent: float = 1.3
     """A bent square whose frame is looked at."""
-    bent_read: float = 800.0
+    bent_read: float = 450.0
     """Those that have one, and how the best look."""
-    curved: float = 3000.0
-    relit: float = 22.0
-    """An outline read cell by cell."""
-    by_pixels: float = 650.0
-    matched: float = 2000.0
-    spline: float = 500.0
+    curved: float = 2100.0
+    relit: float = 34.0
+    """A square read cell by cell."""
+    by_pixels: float = 250.0
+    matched: float = 2200.0
+    spline: float = 190.0
 
 
 COST = Costs()
@@ -96,25 +100,33 @@ def _no_better(candidate: Candidate, before: Candidate) -> bool:
     """Return whether a candidate is the same square as one before, and reads the same not much better."""
     if candidate.reading.marker_id != before.reading.marker_id or candidate.bent != before.bent:
         return False
-    same = same_square(candidate.corners_px[None], before.corners_px)[0]
-    return bool(same) and candidate.reading.correlation < before.reading.correlation + BETTER
+    same = same_square(candidate.corners_px, before.corners_px)
+    return same and candidate.reading.correlation < before.reading.correlation + BETTER
 
 
-def same_square(quads: Array, quad: Array) -> NDArray[np.bool_]:
-    """Return which quads (Q, 4, 2) are the square (4, 2), found again."""
-    apart_px = np.abs(quads.mean(axis=1) - quad.mean(axis=0)).max(axis=1)
-    sides_px, side_px = looks_large(quads), looks_large(quad[None])
-    return np.maximum(apart_px, np.abs(sides_px - side_px)) < SAME_SQUARE * np.minimum(sides_px, side_px)
+@compiled(MATRIX, MATRIX)
+def same_square(quad: Array, other: Array) -> bool:
+    """Return whether two quads (4, 2) are one square, found again."""
+    side_px, other_px = side_of(quad), side_of(other)
+    apart_px = abs(side_px - other_px)
+    for axis in range(2):
+        apart_px = max(apart_px, abs(quad[:, axis].sum() - other[:, axis].sum()) / 4)
+    return apart_px < SAME_SQUARE * min(side_px, other_px)
 
 
+@compiled(CUBE, CUBE, INT)
 def first_distinct(quads: Array, before: Array, most: int) -> Array:
     """Return the first of quads (Q, 4, 2), ``most`` at most, that are neither of ``before`` (B, 4, 2) nor alike."""
-    kept: list[int] = []
-    fresh = np.ones(len(quads), dtype=bool)
-    for quad in before:
-        fresh &= ~same_square(quads, quad)
-    while len(kept) < most and fresh.any():
-        kept.append(int(fresh.argmax()))
-        fresh &= ~same_square(quads, quads[kept[-1]])
-        fresh[kept[-1]] = False
-    return quads[kept]
+    kept, count = np.empty((most, 4, 2)), 0
+    for q in range(len(quads)):
+        if count == most:
+            break
+        fresh = True
+        for b in range(len(before)):
+            fresh = fresh and not same_square(quads[q], before[b])
+        for k in range(count):
+            fresh = fresh and not same_square(quads[q], kept[k])
+        if fresh:
+            kept[count] = quads[q]
+            count += 1
+    return kept[:count].copy()

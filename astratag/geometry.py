@@ -260,7 +260,7 @@ def layer_points(points: NDArray[np.float64], layer: Layer) -> NDArray[np.float6
 def print_from_template(points: NDArray[np.float64], side_m: float) -> NDArray[np.float64]:
     """Return template points (..., 2) on the flat print: metres from its centre, x right, y up."""
     half = TEMPLATE_UNITS / 2
-    return (np.asarray(points) - half) * (side_m / TEMPLATE_UNITS) * np.array([1.0, -1.0])
+    return (np.asarray(points) - half) * (np.array([1.0, -1.0]) * (side_m / TEMPLATE_UNITS))
 
 
 def layer_corners_print(layer: int, side_m: float) -> NDArray[np.float64]:

@@ -66,7 +66,11 @@ class Rough(NamedTuple):
 def rough_matches(synthesis: Synthesis, light: Light, quads: Array, blur_px: float) -> list[Rough]:
     """Return those of rough squares (Q, 4, 2) that are worth aligning, the best first."""
     warps = [HomographyWarp.from_points(OUTER, quad) for quad in quads]
-    rough = [Rough(warp, synthesis.read(light, warp, blur_px)) for warp in warps if _side_px(warp) >= LEAST_SIDE_PX]
+    rough = [
+        Rough(warp, synthesis.read(light, warp, blur_px, glance=True))
+        for warp in warps
+        if _side_px(warp) >= LEAST_SIDE_PX
+    ]
     ahead = [_ahead(one.scores) for one in rough]
     return [rough[i] for i in sorted(range(len(rough)), key=lambda i: -ahead[i]) if ahead[i] >= WORTH_ALIGNING]
 

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.compiled import BOOL, CUBE, INDICES, INT, MATRIX, REAL, VECTOR, compiled
+from astratag.compiled import BOOL, CUBE, INDICES, INT, INTO_INDICES, INTO_VECTOR, MATRIX, REAL, VECTOR, compiled
 
 Array = NDArray[np.float64]
 
@@ -20,6 +20,10 @@ MOST_POINTS = 12
 """Contours that take more points than this, before those on nearly straight lines are left out, are no quads."""
 FARTHEST_ROUNDS = 3
 """How often the point farthest from the one before is looked for, to find two that are far apart."""
+BEGIN, END, AT, PARTS, COUNT = range(5)
+"""What is known of a part of a contour: from which of its points to which, where it leads farthest off a line, and its
+two parts; of the first, how many parts there are."""
+NOT_KNOWN = -1.0
 TINY = 1e-9
 LEAST_SINE = 0.1
 """Of the angle at a quad's corner: at a sharper one its sides meet no farther out than at this."""
@@ -110,26 +114,54 @@ def _farthest_off(contour: Array, begin: int, end: int) -> tuple[float, int]:
     return off, at
 
 
-@compiled(MATRIX, INT, INT, REAL, INT)
-def _simplified(contour: Array, start: int, other: int, tolerance: float, most: int) -> Array:
-    """Return ``simplified`` of a contour (N, 2) of which two points that are kept are known."""
-    polygon, stack = np.empty((most + 1, 2)), np.empty((len(contour) + 2, 2), dtype=np.int64)
-    stack[0, 0], stack[0, 1], stack[1, 0], stack[1, 1] = other, start, start, other
+@compiled(INT)
+def _no_splits(points: int) -> tuple[NDArray[np.int64], Array]:
+    """Return room for how a contour of so many points is split; see ``_simplified``."""
+    return np.empty((2 * points + 4, 5), dtype=np.int64), np.empty(2 * points + 4)
+
+
+@compiled(INT, INT, INTO_INDICES, INTO_VECTOR)
+def _begin_splits(start: int, other: int, splits: NDArray[np.int64], off: Array) -> None:
+    """Begin with the two parts of a contour between two points of it."""
+    for k in range(2):
+        splits[k, BEGIN], splits[k, END] = (start, other) if k == 0 else (other, start)
+        splits[k, PARTS], off[k] = 0, NOT_KNOWN
+    splits[0, COUNT] = 2
+
+
+@compiled(MATRIX, INTO_INDICES, INTO_VECTOR, REAL, INT)
+def _simplified(contour: Array, splits: NDArray[np.int64], off: Array, tolerance: float, most: int) -> Array:
+    """Return ``simplified`` of a contour (N, 2), split further where that is needed.
+
+    Where it is split does not depend on the tolerance: what was found out at one serves the next.  Part k leads ``off``
+    (K,) k, times its length, off a straight line, at a point; it is split there into two parts from ``PARTS`` on.
+    """
+    polygon, stack = np.empty((most + 1, 2)), np.empty(len(contour) + 2, dtype=np.int64)
+    stack[0], stack[1] = 1, 0
     top, size = 2, 0
     while top > 0:
         top -= 1
-        begin, end = stack[top]
+        k = stack[top]
+        begin, end = splits[k, BEGIN], splits[k, END]
+        if off[k] == NOT_KNOWN:
+            off[k], splits[k, AT] = _farthest_off(contour, begin, end)
         x, y = contour[begin]
         dx, dy = contour[end, 0] - x, contour[end, 1] - y
-        off, at = _farthest_off(contour, begin, end)
-        if off * off <= tolerance * tolerance * (dx * dx + dy * dy):
+        if off[k] * off[k] <= tolerance * tolerance * (dx * dx + dy * dy):
             polygon[size, 0], polygon[size, 1] = x, y
             size += 1
             if size > most:
                 return polygon
-        else:
-            stack[top, 0], stack[top, 1], stack[top + 1, 0], stack[top + 1, 1] = at, end, begin, at
-            top += 2
+            continue
+        parts = splits[k, PARTS]
+        if parts == 0:
+            parts, at = splits[0, COUNT], splits[k, AT]
+            splits[k, PARTS], splits[0, COUNT] = parts, parts + 2
+            splits[parts, BEGIN], splits[parts, END], splits[parts, PARTS] = begin, at, 0
+            splits[parts + 1, BEGIN], splits[parts + 1, END], splits[parts + 1, PARTS] = at, end, 0
+            off[parts] = off[parts + 1] = NOT_KNOWN
+        stack[top], stack[top + 1] = parts + 1, parts
+        top += 2
     return _cleaned(polygon, size, tolerance * tolerance)
 
 
@@ -145,7 +177,9 @@ def simplified(contour: Array, tolerance: float, most: int) -> Array:
     start, other, squared = _far_apart(contour)
     if squared <= tolerance * tolerance:
         return contour[start : start + 1].copy()
-    return _simplified(contour, start, other, tolerance, most)
+    splits, off = _no_splits(len(contour))
+    _begin_splits(start, other, splits, off)
+    return _simplified(contour, splits, off, tolerance, most)
 
 
 @compiled(MATRIX)
@@ -189,15 +223,18 @@ def _length(polygon: Array) -> float:
     return length
 
 
-@compiled(MATRIX, REAL, VECTOR, BOOL)
-def _convex_quad(contour: Array, perimeter: float, tolerances: Array, whole: bool) -> Array:
+@compiled(MATRIX, REAL, VECTOR, BOOL, INTO_INDICES, INTO_VECTOR)
+def _convex_quad(
+    contour: Array, perimeter: float, tolerances: Array, whole: bool, splits: NDArray[np.int64], off: Array
+) -> Array:
     """Return the convex quad (4, 2) that a contour (N, 2) simplifies to, else an empty one (0, 2); see below."""
     best, finest, too_fine, too_coarse = np.empty((0, 2)), np.inf, 0.0, np.inf
     start, other, _ = _far_apart(contour)
+    _begin_splits(start, other, splits, off)
     for tolerance in tolerances:
         if not too_fine < tolerance < too_coarse:
             continue
-        polygon = _simplified(contour, start, other, tolerance * perimeter, MOST_POINTS)
+        polygon = _simplified(contour, splits, off, tolerance * perimeter, MOST_POINTS)
         if len(polygon) > MOST_POINTS:
             too_fine = tolerance
         elif len(polygon) < 4:
@@ -225,14 +262,15 @@ def convex_quads(
     """
     count = len(perimeters)
     found, quads, hulls = np.zeros(count, dtype=np.bool_), np.zeros((count, 4, 2)), 0
+    splits, off = _no_splits(np.diff(starts).max() if count > 0 else 0)
     for i in range(count):
         contour = points[starts[i] : starts[i + 1]]
-        quad = _convex_quad(contour, perimeters[i], tolerances, whole)
+        quad = _convex_quad(contour, perimeters[i], tolerances, whole, splits, off)
         if len(quad) == 0 and hulls < most_hulls:
             hulls += 1
             around = hull(contour)
             if 4 <= len(around) < len(contour):
-                quad = _convex_quad(around, _length(around), tolerances, whole)
+                quad = _convex_quad(around, _length(around), tolerances, whole, splits, off)
         if len(quad) > 0:
             found[i], quads[i] = True, quad
     return found, quads

@@ -2,8 +2,9 @@
 
 A hard shadow multiplies light, glare adds to it until the image saturates.  So every cell is judged against the
 ink and the paper around it, in logarithms of linear light.  *Ink* is what the nearest points show that are black in
-every identity.  *Paper* is the brightest nearby, either as a level (in glare nothing is brighter than saturated) or
-as a ratio to its own ink (that is the same in shadow and out of it), whichever is darker.
+every identity.  *Paper* is the second brightest nearby, for the brightest may be noise: either as a level (in glare
+nothing is brighter than saturated) or as a ratio to its own ink (that is the same in shadow and out of it), whichever
+is darker.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ Light = NDArray[np.float32]
 Seen = NDArray[np.bool_]
 
 FULL = 255.0
+LOG_FULL = math.log(FULL)
 DARKEST = 0.5
 """Linear light, of 255, that is added before logarithms are taken: what is darker is noise."""
 CODE_EXPONENT = 1 / 2.4
@@ -32,8 +34,6 @@ INK_POINTS, PAIR_POINTS, PAPER_POINTS = 7, 3, 12
 
 Odd, because medians of them follow the edge of a shadow; a dozen cells and margin points always have paper in them.
 """
-BRIGHTEST = 2
-"""Paper is the second brightest of its neighbours: the brightest may be noise."""
 LEAST_CONTRAST, MOST_CELLS = 0.15, 0.8
 """Contrast below this fraction of what only the best fifth of the cells exceed counts as hidden."""
 LEAST_CONTRAST_GREY = 6.0
@@ -71,23 +71,31 @@ _PAPER_OF_CELL = _nearest(_CENTRES, np.concatenate([_CENTRES, _MARGIN]), PAPER_P
 
 
 @compiled(VECTOR, INDICES)
-def _ordered(values: Array, which: NDArray[np.int64]) -> Array:
-    """Return those of values (N,) that ``which`` (K,) says, in rising order."""
-    ordered = np.empty(len(which))
+def _median(values: Array, which: NDArray[np.int64]) -> float:
+    """Return the middle one of those of values (N,) that ``which`` (K,) says."""
+    middle = 0.0
     for k in range(len(which)):
-        value = values[which[k]]
-        place = k
-        while place > 0 and ordered[place - 1] > value:
-            ordered[place] = ordered[place - 1]
-            place -= 1
-        ordered[place] = value
-    return ordered
+        value, below, before = values[which[k]], 0, 0
+        for other in range(len(which)):
+            below += values[which[other]] < value
+            before += values[which[other]] == value and other < k
+        middle = value if below + before == len(which) // 2 else middle
+    return middle
+
+
+@compiled(VECTOR, INDICES)
+def _second_largest(values: Array, which: NDArray[np.int64]) -> float:
+    """Return the second largest of those of values (N,) that ``which`` (K,) says."""
+    largest, second = -np.inf, -np.inf
+    for k in which:
+        largest, second = max(largest, values[k]), max(second, min(largest, values[k]))
+    return second
 
 
 @compiled(REAL)
 def _grey(logarithm: float) -> float:
     """Return about which grey value a logarithm of light has."""
-    return FULL * (math.exp(logarithm) / FULL) ** CODE_EXPONENT
+    return FULL * math.exp(CODE_EXPONENT * (logarithm - LOG_FULL))
 
 
 @compiled(VECTOR, VECTOR, VECTOR)
@@ -96,20 +104,20 @@ def _relit(samples: Array, ink: Array, margin: Array) -> tuple[Array, Seen]:
     levels, ratios = np.empty(CELLS + len(margin)), np.empty(CELLS + len(margin))
     ink_of_cell, beside_margin = np.empty(CELLS), np.empty(len(margin))
     for c in range(CELLS):
-        ink_of_cell[c] = _ordered(ink, _INK_OF_CELL[c])[INK_POINTS // 2]
+        ink_of_cell[c] = _median(ink, _INK_OF_CELL[c])
         levels[c] = samples[c * SAMPLES_A_CELL : (c + 1) * SAMPLES_A_CELL].mean()
         ratios[c] = levels[c] - ink_of_cell[c]
     for m in range(len(margin)):
-        ink_of_margin = _ordered(ink, _INK_OF_MARGIN[m])[PAIR_POINTS // 2]
+        ink_of_margin = _median(ink, _INK_OF_MARGIN[m])
         levels[CELLS + m], ratios[CELLS + m] = margin[m], margin[m] - ink_of_margin
         beside_margin[m] = _grey(margin[m]) - _grey(ink_of_margin)
     contrast, clear, visible = np.empty(CELLS), np.empty(CELLS), np.empty(CELLS)
     for c in range(CELLS):
-        by_ratio = _ordered(ratios, _PAPER_OF_CELL[c])[-BRIGHTEST]
-        contrast[c] = min(by_ratio, _ordered(levels, _PAPER_OF_CELL[c])[-BRIGHTEST] - ink_of_cell[c])
+        by_ratio = _second_largest(ratios, _PAPER_OF_CELL[c])
+        contrast[c] = min(by_ratio, _second_largest(levels, _PAPER_OF_CELL[c]) - ink_of_cell[c])
         clear[c] = _grey(ink_of_cell[c] + contrast[c]) - _grey(ink_of_cell[c])
-        visible[c] = min(clear[c], _ordered(beside_margin, _MARGIN_OF_CELL[c])[PAIR_POINTS // 2])
-    ordered, place = _ordered(clear, np.arange(CELLS)), MOST_CELLS * (CELLS - 1)
+        visible[c] = min(clear[c], _median(beside_margin, _MARGIN_OF_CELL[c]))
+    ordered, place = np.sort(clear), MOST_CELLS * (CELLS - 1)
     below = int(place)
     exceeded = ordered[below] + (place - below) * (ordered[below + 1] - ordered[below])
     least = max(LEAST_CONTRAST * exceeded, LEAST_CONTRAST_GREY)

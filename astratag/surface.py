@@ -30,6 +30,10 @@ class Flat:
         """Return outward unit normals (..., 3) at print points (..., 2)."""
         return np.broadcast_to(np.array([0.0, 0.0, 1.0]), (*on_print.shape[:-1], 3)).copy()
 
+    def wrapped(self, on_print: Array) -> tuple[Array, Array]:
+        """Return both."""
+        return self.points(on_print), self.normals(on_print)
+
 
 @dataclass(frozen=True)
 class Cylinder:
@@ -48,13 +52,14 @@ class Cylinder:
 
     def points(self, on_print: Array) -> Array:
         """Return print points (..., 2) in the marker frame (..., 3), metres."""
-        return self._wrapped(on_print)[0]
+        return self.wrapped(on_print)[0]
 
     def normals(self, on_print: Array) -> Array:
         """Return outward unit normals (..., 3) at print points (..., 2)."""
-        return self._wrapped(on_print)[1]
+        return self.wrapped(on_print)[1]
 
-    def _wrapped(self, on_print: Array) -> tuple[Array, Array]:
+    def wrapped(self, on_print: Array) -> tuple[Array, Array]:
+        """Return both."""
         shape = (*np.shape(on_print)[:-1], 3)
         flat = np.ascontiguousarray(np.reshape(on_print, (-1, 2)), dtype=float)
         points, normals = _wrapped(flat, self.radius_m, self.axis_rad)

@@ -62,7 +62,7 @@ TEXELS = 4.0
 REACH, LAYER_REACH = 0.07, 0.13
 """How far beyond the black square the print is looked at, as a fraction of its side; and to tell layers apart by."""
 SPACING_PX = 0.8
-MOST_LINES, FEWEST_LINES = 32, 12
+MOST_LINES, MOST_AT_A_GLANCE, FEWEST_LINES = 32, 20, 12
 """Grid lines across the print: so many that they are ``SPACING_PX`` apart where it looks widest, within bounds."""
 SIGMA_FLOOR_PX = 0.012
 """What a point's standard deviation never falls below: print, lens model, shape of the blur."""
@@ -135,7 +135,7 @@ def _nodes(count: int) -> Array:
     return np.ascontiguousarray(np.linalg.solve(np.linalg.cholesky(nodes.T @ nodes / count), nodes.T).T)
 
 
-_MANY_NODES = _nodes(MANY_NODES)
+_MANY_NODES, _FEWER_NODES = _nodes(MANY_NODES), _nodes(NODES)
 
 
 class Nodes(NamedTuple):
@@ -245,9 +245,9 @@ def _units(to_template: Array) -> tuple[float, float]:
     return ranked(fewest, count // 10), ranked(most, count - 1 - count // 10)
 
 
-def look(warp: FittedWarp, shape: tuple[int, ...], reach: float = REACH) -> Look | None:
+def look(warp: FittedWarp, shape: tuple[int, ...], reach: float = REACH, most_lines: int = MOST_LINES) -> Look | None:
     """Return how a print and ``reach`` sides around it lie in an image of ``shape`` (H, W); None when hardly at all."""
-    lines = int(min(max(_widest_px(warp) * (1 + 2 * reach) / SPACING_PX, FEWEST_LINES), MOST_LINES))
+    lines = int(min(max(_widest_px(warp) * (1 + 2 * reach) / SPACING_PX, FEWEST_LINES), most_lines))
     points, stencil = _grid(lines, reach)
     spacing = TEMPLATE_UNITS * (1 + 2 * reach) / (lines - 1)
     use, *seen = _seen(np.ascontiguousarray(warp(stencil)), warp.visible(points), shape[0], shape[1], spacing)
@@ -376,16 +376,18 @@ class Synthesis:
         self._dictionary = dictionary
         self._codes = dictionary.oriented.reshape(-1, CELLS).astype(float)
 
-    def read(self, light: Light, warp: FittedWarp, blur_px: float) -> Array:
+    def read(self, light: Light, warp: FittedWarp, blur_px: float, *, glance: bool = False) -> Array:
         """Return the correlation (I, 4) of an image with each identity, its print turned clockwise by quarters.
 
-        Of cells only: what all identities have in common, and light that varies in a plane, are taken out.
+        Of cells only: what all identities have in common, and light that varies in a plane, are taken out.  A
+        ``glance`` is at fewer points, and through a coarser blur.
         """
-        seen = look(warp, light.shape)
+        seen = look(warp, light.shape, most_lines=MOST_AT_A_GLANCE if glance else MOST_LINES)
         if seen is None:
             return np.zeros((len(self._codes) // 4, 4))
         value = values(light, seen.at_px)
-        products = _products(_LABELS, seen.template, seen.to_template, seen.weight, value, blur_px * _MANY_NODES)
+        nodes_px = blur_px * (_FEWER_NODES if glance else _MANY_NODES)
+        products = _products(_LABELS, seen.template, seen.to_template, seen.weight, value, nodes_px)
         left = left_over(products, OF_COMMON)
         among, common, energy = left[:CELLS, :CELLS], left[:CELLS, CELLS], left[CELLS, CELLS]
         length = np.sqrt(((self._codes @ among) * self._codes).sum(axis=1) * energy)

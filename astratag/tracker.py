@@ -178,9 +178,8 @@ class Tracker:
         view = self.detector.view(view.gray, view.camera, [box])
         (left, top), (right, bottom) = box
         part = view.gray[top:bottom, left:right]
-        found = self.detector.search(
-            view, find_outlines(part, COARSE if part.size > HALVE_FROM_PX else PLAIN).moved(box[0])
-        )
+        outlines = find_outlines(part, COARSE if part.size > HALVE_FROM_PX else PLAIN).moved(box[0])
+        found = self.detector.search(view, outlines) or self.detector.search_later(view)
         return next((seen for seen in found if seen.marker_id == track.marker_id), None)
 
 

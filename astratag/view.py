@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astratag.camera import Camera
+from astratag.candidates import Candidate
 from astratag.checks import picture
 from astratag.cylinder import assumed_camera
 from astratag.effort import Effort, Tries
@@ -28,8 +29,8 @@ class View:
     """One image as the detector works on it: gray, in linear light, and with its camera.
 
     ``effort`` is what all that is done in it is taken from; ``by_edges``, ``aligned`` and ``curved`` hold what was
-    looked at closely, and end that when it was enough; ``scaled`` holds it at the resolutions it was searched at,
-    ``outlines`` what was found, one way and another.
+    looked at closely, and end that when it was enough; ``later`` those that are moved only when nothing else is found;
+    ``scaled`` holds it at the resolutions it was searched at, ``outlines`` what was found, one way and another.
     """
 
     gray: NDArray[np.uint8]
@@ -43,6 +44,7 @@ class View:
     by_edges: Tries = field(default_factory=lambda: Tries(MAX_BY_EDGES))
     aligned: Tries = field(default_factory=lambda: Tries(MAX_ALIGNED))
     curved: Tries = field(default_factory=lambda: Tries(MAX_CURVED))
+    later: list[Candidate] = field(default_factory=list)
     scaled: dict[float, Scaled] = field(default_factory=dict)
     outlines: dict[Binarisation, Outlines] = field(default_factory=dict)
 

@@ -188,7 +188,7 @@ MOST_KEPT = 128
 @lru_cache(maxsize=64)
 def _on_surface(surface: Surface, side_m: float, template: bytes) -> tuple[Array, Array]:
     on_print = print_from_template(np.frombuffer(template).reshape(-1, 2), side_m)
-    points, normals = (np.ascontiguousarray(of(on_print).T) for of in (surface.points, surface.normals))
+    points, normals = (np.ascontiguousarray(part.T) for part in surface.wrapped(on_print))
     points.flags.writeable = normals.flags.writeable = False
     return points, normals
 
