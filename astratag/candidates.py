@@ -38,12 +38,12 @@ MAX_READ_FLAT = 12
 """Quads that are read, the likeliest by their cells' middles: of 230 that were markers all were among the first two."""
 LEAST_LIKENESS = 0.45
 """Correlation of a layer, as printed, with what is seen below which it is something else."""
-AT_ONCE, AT_ONCE_RELIT = 0.67, 0.7
+AT_ONCE, AT_ONCE_RELIT = 0.7, 0.56
 """Correlation from which a flat square is moved at once.  Of unevenly lit ones, of fewer cells, how much better than
 promising it must be, together with a share of how they look.
 
-Of 393 that were markers once moved 89 in a hundred have more, of others that read like one 31; of 143 unevenly lit ones
-80, of others 31.
+Of 393 that were markers once moved 82 in a hundred have more, of others that read like one 11; of 143 unevenly lit ones
+95, of others 66.
 """
 SHARE_OF_LOOKS, WORTH_MOVING = 0.75, 0.54
 """What this share of how a flat square looks, and how much better than promising it reads, must come to.

@@ -55,7 +55,7 @@ THIN = Binarisation(scale=2.0, smooth_px=1, window_px=11)
 
 BLOCK_PX, STEP_PX = 16, 5
 """Where an image is worth twice its resolution is decided in blocks, by the largest step of brightness in each."""
-FINE_PX = 32_000
+FINE_PX = 40_000
 """How much of an image is looked at that closely, in its own pixels, the largest steps first.
 
 Paper and ink make the largest: what was found so filled at most a tenth of 640x480, and a fourth among sharp clutter.
