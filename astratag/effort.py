@@ -74,7 +74,7 @@ class Costs:
     relit: float = 34.0
     """A square read cell by cell."""
     by_pixels: float = 250.0
-    matched: float = 2200.0
+    matched: float = 1500.0
     spline: float = 190.0
 
 

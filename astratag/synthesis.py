@@ -418,14 +418,15 @@ class Synthesis:
         blur_px: float,
         steps: int = STEPS,
         settled_px: float = SETTLED_PX,
+        hopeless: float = -1.0,
     ) -> Alignment[W] | None:
         """Return ``warp`` and the blur moved until the image looks most like a marker; None when it is lost.
 
         Light and contrast may each vary in a plane over the print.  A step that moves it by less than ``settled_px`` is
-        the last.
+        the last.  What correlates less than ``hopeless`` once a step was taken is given up.
         """
         alignment = None
-        for _ in range(steps):
+        for taken in range(steps):
             seen = look(warp, light.shape)
             if seen is None:
                 return None
@@ -434,7 +435,7 @@ class Synthesis:
             x, covariance, apart, correlation, moved_px = step(
                 light, seen.at_px, seen.template, seen.weight, shown, J, warp.step_sigma()
             )
-            if apart <= 0:
+            if apart <= 0 or (taken == 1 and correlation < hopeless):
                 return None
             warp = warp.stepped(x[:-1])
             blur_px = min(max(blur_px * math.exp(x[-1]), LEAST_BLUR_PX), MOST_BLUR_PX)
