@@ -88,11 +88,8 @@ class CylinderWarp:
 
     def _seen(self, template: Array) -> tuple[Array, NDArray[np.bool_]]:
         surface, pose = self.surface, self.pose
-        on_print, nearest_m = (
-            print_from_template(np.reshape(template, (-1, 2)), pose.side_m),
-            NEAREST_SIDES * pose.side_m,
-        )
-        lens = pose.camera.lens
+        on_print = print_from_template(np.reshape(template, (-1, 2)), pose.side_m)
+        lens, nearest_m = pose.camera.lens, NEAREST_SIDES * pose.side_m
         return _seen_on_cylinder(on_print, pose.T_cam_marker, lens, surface.radius_m, surface.axis_rad, nearest_m)
 
     def step_sigma(self) -> Array:

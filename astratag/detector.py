@@ -167,9 +167,7 @@ class Detector(Confirmer):
         listed are worth another look where nothing is found yet, and nothing else is taken from it.
         """
         found = list(found)
-        effort = Effort(
-            view.gray.size, flat=not self._bends
-        )  # of its own: what was found at once took little, and is worth the rest
+        effort = self._effort(view.gray)  # of its own: what was found at once took little, and is worth the rest
         for how in ways if found else ():
             missing = set(self.markers) - {seen.marker_id for seen in found}
             if not missing:
@@ -194,7 +192,7 @@ class Detector(Confirmer):
             camera.require_size(gray.shape[1], gray.shape[0])
         if self._lit.shape != gray.shape:
             self._lit = np.zeros(gray.shape, dtype=np.float32)
-        return View(gray, Light(gray, self._of_gray), camera, Effort(gray.size, flat=not self._bends), self._lit, boxes)
+        return View(gray, Light(gray, self._of_gray), camera, self._effort(gray), self._lit, boxes)
 
     def search(self, view: View, outlines: Outlines, *, whole: bool = False) -> list[Detection]:
         """Return the markers among outlines read as if flat, each once, the surest first; see ``quads_of``."""
@@ -280,6 +278,10 @@ class Detector(Confirmer):
         """Return whether a marker may be on a curved surface: one that is listed, or any when none is."""
         specs = self.markers.values() or [self.default]
         return any(not isinstance(spec.surface, Flat) for spec in specs)
+
+    def _effort(self, gray: NDArray[np.uint8]) -> Effort:
+        """Return what an image is worth."""
+        return Effort(gray.size, flat=not self._bends)
 
     def _confirm_all(self, view: View, candidates: Sequence[Candidate], quick: bool = False) -> list[Detection]:
         """Return the markers among candidates, each once; by their edges, else the best few after an alignment."""

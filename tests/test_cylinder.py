@@ -35,6 +35,14 @@ def test_jacobian_is_the_derivative(warp: CylinderWarp) -> None:
 
 
 @pytest.mark.parametrize("warp", warps())
+def test_points_are_seen_as_through_a_pose_on_that_cylinder(warp: CylinderWarp) -> None:
+    points = np.random.default_rng(2).uniform(-200, 900, (200, 2))
+    np.testing.assert_allclose(warp(points), warp.pose(points), atol=1e-9)
+    np.testing.assert_array_equal(warp.visible(points), warp.pose.visible(points))
+    np.testing.assert_allclose(warp.jacobian(points)[:, :, :6], warp.pose.jacobian(points), atol=1e-7)
+
+
+@pytest.mark.parametrize("warp", warps())
 def test_one_of_the_squares_through_its_corners_is_itself(warp: CylinderWarp) -> None:
     bent = bent_through(CAMERA, warp(OUTER)[None])
     found = [bent.warp(*which).pose.T_cam_marker for which in bent.all.tolist()]

@@ -11,7 +11,7 @@ import pytest
 from astratag import Camera, Cylinder, Detector, Flat, Surface, Tracker, load_dictionary
 from astratag.edges import inverse_transfer
 from astratag.geometry import QUIET_MARGIN, TEMPLATE_UNITS, square
-from astratag.matching import Match, acceptance_of_pixels, match, rough_matches
+from astratag.matching import HOPELESS, Match, acceptance_of_pixels, match, rough_matches
 from astratag.synthesis import Expected, Synthesis, _nodes, _picture, _weighted, expected, look
 from astratag.transforms import difference, exp_so3, perturb, pose
 from astratag.warp import FittedWarp, HomographyWarp, PoseWarp
@@ -138,6 +138,15 @@ def test_alignment_finds_corners_far_below_a_pixel_with_honest_covariance(side_p
         assert np.sqrt(np.mean(error**2)) < error_px
         squares.append(np.mean(error**2) / aligned.sigma_px(square(0.0, 700.0)) ** 2)
     assert 0.2 < np.mean(squares) < 2.5
+
+
+@pytest.mark.parametrize("side_px", [20, 48])
+def test_what_is_no_print_is_given_up_after_a_step(side_px: float) -> None:
+    start = HomographyWarp.from_points(square(0.0, 700.0), corners(tumbled(side_px, 3)) + 0.5)
+    noise = cv2.GaussianBlur(np.random.default_rng(3).uniform(0, 255, (240, 320)), (0, 0), 2.0).astype(np.uint8)
+    for image, given_up in ((photograph(tumbled(side_px, 3)), False), (noise, True)):
+        found = SYNTHESIS.align(light_of(image), start, 7, BLUR_PX, hopeless=HOPELESS)
+        assert (found is None) == given_up
 
 
 def test_alignment_works_on_any_warp_and_tells_the_blur() -> None:
