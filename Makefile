@@ -53,7 +53,6 @@ bench: $(STAMP) ## Run the benchmarks
 	$(RUN)/python -m benchmarks.detection --images 10
 	$(RUN)/python -m benchmarks.filter
 	$(RUN)/python -m benchmarks.corridors
-	$(RUN)/python -m benchmarks.corridors
 	$(RUN)/python -m benchmarks.throughput
 
 proto: $(STAMP) ## Write the .proto files out again

@@ -25,7 +25,6 @@ from astratag.curved import (
     Seen,
     clearly_bent,
     covariance_of,
-    facing,
     moved_onto,
     on_cylinder,
     seen_whole,
@@ -143,7 +142,7 @@ class Confirmer(Describer):
         """Return whether no plane explains what is seen of a print nearly as well as a cylinder."""
         plane = HomographyWarp.from_points(SQUARES[seen.layer], seen.warp(SQUARES[seen.layer]))
         if fit is None:
-            return self._more_like(view, marker_id, facing(seen.warp), plane)
+            return self._more_like(view, marker_id, seen.warp.facing, plane)
         flat = settle(view.light, plane, self.near(marker_id))
         return clearly_bent(fit) and (flat is None or fit.cost < CURVED_GAIN * flat.cost)
 

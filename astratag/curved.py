@@ -36,13 +36,12 @@ from astratag.signature import (
     SAMPLES,
     Artwork,
     Codebook,
-    Warp,
     cell_values,
     layer_cells,
     sample,
     unit,
 )
-from astratag.warp import OUTSIDE_PX, FittedWarp
+from astratag.warp import FittedWarp
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -55,9 +54,9 @@ PROMISING, MAX_CANDIDATES, MAX_READ, MAX_GLANCED_AT = 0.44, 4, 8, 200
 
 Of so many whose cells are glanced at, the likeliest: of 56 bent prints that were found, all were among the first 3.
 """
-MAX_LOOKED_AT, SHARE_OF_LOOKS, AT_ONCE, WORTH_MOVING = 10, 0.25, 0.66, 0.62
-"""Squares that are looked at; and what their correlation, and this share of how they look, must come to for them to be
-moved at once, or at all.
+SHARE_OF_LOOKS, AT_ONCE, WORTH_MOVING = 0.25, 0.66, 0.62
+"""What the correlation of a bent square, and this share of how it looks, must come to for it to be moved at once, or at
+all.
 
 Of 581 bent prints that were found 98 in a hundred came to the first, all to the second; of others half came to the
 first.
@@ -168,8 +167,6 @@ def curved_candidates(gray: Image, bent: Bent, codebook: Codebook, artwork: Artw
     corners_px = bent.project(OUTER, at)
     found: list[Candidate] = []
     for i, reading in codebook.best_readings(cells, np.full(len(at), PROMISING), MAX_READ):
-        if len(found) == MAX_LOOKED_AT:
-            break
         turns = reading.quarter_turns
         corners = np.roll(corners_px[i], -turns, axis=0)
         candidate = Candidate(reading, corners, bent.warp(*at[i].tolist()).turned(turns), bent=True)
@@ -188,7 +185,8 @@ def _with_middle(cells: Array, facing: NDArray[np.bool_]) -> Array:
 
 def _promise(gray: Image, candidate: Candidate, artwork: Artwork) -> float:
     """Return how promising a bent square is, by how well it reads, and a share of how it looks as some layer."""
-    looks = artwork.layer_scores(gray, facing(candidate.warp), candidate.reading.marker_id, candidate.side_px)
+    assert isinstance(candidate.warp, CylinderWarp)
+    looks = artwork.layer_scores(gray, candidate.warp.facing, candidate.reading.marker_id, candidate.side_px)
     return candidate.reading.correlation + SHARE_OF_LOOKS * float(looks.max()) - AT_ONCE
 
 
@@ -218,7 +216,7 @@ def seen_whole(gray: Image, candidate: Candidate, side_m: float, codebook: Codeb
     """
     square, marker_id, side_px = candidate.warp, candidate.reading.marker_id, candidate.side_px
     assert isinstance(square, CylinderWarp)
-    scores = artwork.layer_scores(gray, facing(square), marker_id, side_px)
+    scores = artwork.layer_scores(gray, square.facing, marker_id, side_px)
     for layer in np.argsort(-scores).tolist():
         if scores[layer] < max(LEAST_SCORE, scores.max() - UNCLEAR):
             break
@@ -231,7 +229,7 @@ def seen_whole(gray: Image, candidate: Candidate, side_m: float, codebook: Codeb
             moved = _aligned(gray, moved, artwork, candidate.reading, layer, side_px)
             if moved is None:
                 continue
-        looks = artwork.layer_scores(gray, facing(moved), marker_id, side_px)
+        looks = artwork.layer_scores(gray, moved.facing, marker_id, side_px)
         if looks[layer] < LEAST_LOOKS or (layer == 0 and looks[0] < looks[1:].max() + CLEARLY_OUTERMOST):
             continue
         whole = moved.of_whole(side_m, LAYERS[layer].scale)
@@ -254,7 +252,7 @@ def _aligned(
     coarse = np.arange(len(points)).reshape(artwork.GRID, -1)[::2, ::2].ravel()
 
     def looks(warp: CylinderWarp) -> float:
-        return float(artwork.layer_scores(gray, facing(warp), reading.marker_id, side_px)[layer])
+        return float(artwork.layer_scores(gray, warp.facing, reading.marker_id, side_px)[layer])
 
     before = looks(warp)
     for blur, steps, among in ((COARSE_BLUR, COARSE_STEPS, coarse), (0.0, FINE_STEPS, artwork.half)):
@@ -268,11 +266,6 @@ def _aligned(
         if before < HOPELESS_LOOKS or reading.correlation + before / 2 < HOPELESS:
             return None
     return warp
-
-
-def facing(warp: FittedWarp) -> Warp:
-    """Return a warp that takes what does not face the viewer out of the image."""
-    return lambda template: np.where(warp.visible(template)[:, None], warp(template), OUTSIDE_PX)
 
 
 class LayerReading(NamedTuple):

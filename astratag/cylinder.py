@@ -20,7 +20,7 @@ from astratag.compiled import CUBE, INT, MATRIX, REAL, VECTOR, array, compiled
 from astratag.geometry import TEMPLATE_UNITS, print_from_template, square
 from astratag.surface import Cylinder
 from astratag.transforms import pose
-from astratag.warp import GRAZING_COSINE, NEAREST_SIDES, OUTSIDE_PX, PoseWarp, in_camera, slopes_of
+from astratag.warp import GRAZING_COSINE, NEAREST_SIDES, OUTSIDE_PX, PoseWarp, along_both_axes, in_camera
 
 Array = NDArray[np.float64]
 
@@ -68,13 +68,15 @@ class CylinderWarp:
 
     def jacobian(self, template: Array) -> Array:
         """Return the derivative (N, 2, 8): the pose's six, then curvature and axis."""
-        surface, pose = self.surface, self.pose
-        on_print = print_from_template(np.ascontiguousarray(template), pose.side_m)
-        return _jacobian(on_print, pose.T_cam_marker, pose.camera.lens, surface.radius_m, surface.axis_rad, pose.side_m)
+        return along_both_axes(self, template)
 
     def slopes(self, template: Array, along: Array) -> Array:
-        """Return the derivative (8, N) along unit vectors (2, N)."""
-        return slopes_of(self.jacobian(template), np.ascontiguousarray(along))
+        """Return the derivative (8, N) along image vectors (2, N)."""
+        surface, pose = self.surface, self.pose
+        on_print, along = print_from_template(np.ascontiguousarray(template), pose.side_m), np.ascontiguousarray(along)
+        return _slopes(
+            on_print, pose.T_cam_marker, pose.camera.lens, surface.radius_m, surface.axis_rad, pose.side_m, along
+        )
 
     def stepped(self, delta: Array) -> CylinderWarp:
         """Return pose, curvature and axis moved."""
@@ -85,6 +87,11 @@ class CylinderWarp:
     def visible(self, template: Array) -> NDArray[np.bool_]:
         """Return which points face the camera by more than a grazing angle."""
         return self._seen(template)[1]
+
+    def facing(self, template: Array) -> Array:
+        """Return pixels (N, 2) of template points (N, 2), those that do not face the viewer outside every image."""
+        at, visible = self._seen(template)
+        return np.where(visible[:, None], at, OUTSIDE_PX)
 
     def _seen(self, template: Array) -> tuple[Array, NDArray[np.bool_]]:
         surface, pose = self.surface, self.pose
@@ -145,17 +152,17 @@ def _seen_on_cylinder(
     return at, facing
 
 
-@compiled(MATRIX, MATRIX, VECTOR, REAL, REAL, REAL)
-def _jacobian(
-    on_print: Array, T_cam_marker: Array, lens: Array, radius_m: float, axis_rad: float, side_m: float
+@compiled(MATRIX, MATRIX, VECTOR, REAL, REAL, REAL, MATRIX)
+def _slopes(
+    on_print: Array, T_cam_marker: Array, lens: Array, radius_m: float, axis_rad: float, side_m: float, along: Array
 ) -> Array:
-    """Return how the pixels of print points (N, 2) move (N, 2, 8) with the pose, and the cylinder's curvature and axis.
+    """Return how the pixels of print points (N, 2) move along image vectors (2, N): (8, N).
 
-    The pose is perturbed from the right, as by ``pose_jacobian``.
+    With the pose, perturbed from the right as by ``pose_jacobian``, and with the cylinder's curvature and axis.
     """
     T, c, s = T_cam_marker, math.cos(axis_rad), math.sin(axis_rad)
     radius_step = -(radius_m**2) / side_m  # d radius / d curvature
-    J = np.empty((len(on_print), 2, 8))
+    slopes = np.empty((8, len(on_print)))
     for i in range(len(on_print)):
         x, y = on_print[i, 0], on_print[i, 1]
         a, b = c * x + s * y, c * y - s * x  # along the axis, and across it
@@ -169,16 +176,14 @@ def _jacobian(
         bowed, slid, turned = radius_step * (sine - angle * cosine), b - across, a * (1 - cosine)
         ux, uy, uz = -s * bowed, c * bowed, radius_step * (cosine - 1 + angle * sine)  # by curvature
         vx, vy, vz = c * slid - s * turned, s * slid + c * turned, a * sine  # by the axis
-        for axis in range(2):
-            gx, gy, gz = pixel_slope(X, Y, Z, lens, 1.0 - axis, 1.0 * axis)
-            wx = T[0, 0] * gx + T[1, 0] * gy + T[2, 0] * gz
-            wy = T[0, 1] * gx + T[1, 1] * gy + T[2, 1] * gz
-            wz = T[0, 2] * gx + T[1, 2] * gy + T[2, 2] * gz
-            J[i, axis, 0], J[i, axis, 1], J[i, axis, 2] = wx, wy, wz
-            J[i, axis, 3], J[i, axis, 4] = py * wz - inward * wy, inward * wx - px * wz
-            J[i, axis, 5] = px * wy - py * wx
-            J[i, axis, 6], J[i, axis, 7] = ux * wx + uy * wy + uz * wz, vx * wx + vy * wy + vz * wz
-    return J
+        gx, gy, gz = pixel_slope(X, Y, Z, lens, along[0, i], along[1, i])
+        wx = T[0, 0] * gx + T[1, 0] * gy + T[2, 0] * gz
+        wy = T[0, 1] * gx + T[1, 1] * gy + T[2, 1] * gz
+        wz = T[0, 2] * gx + T[1, 2] * gy + T[2, 2] * gz
+        slopes[0, i], slopes[1, i], slopes[2, i] = wx, wy, wz
+        slopes[3, i], slopes[4, i], slopes[5, i] = py * wz - inward * wy, inward * wx - px * wz, px * wy - py * wx
+        slopes[6, i], slopes[7, i] = ux * wx + uy * wy + uz * wz, vx * wx + vy * wy + vz * wz
+    return slopes
 
 
 def assumed_camera(width_px: int, height_px: int) -> Camera:

@@ -29,12 +29,25 @@ def dot(a: Array, b: Array) -> float:
 
 @compiled(MATRIX)
 def gram(columns: Array) -> Array:
-    """Return the products (P, P) of columns (P, N) with each other."""
+    """Return the products (P, P) of columns (P, N) with each other.
+
+    Two by two, so that each number that is loaded is used twice.
+    """
     size = len(columns)
     products = np.empty((size, size))
-    for i in range(size):
-        for j in range(i + 1):
-            products[i, j] = products[j, i] = dot(columns[i], columns[j])
+    for i in range(0, size, 2):
+        k = min(i + 1, size - 1)
+        for j in range(0, i + 1, 2):
+            m = min(j + 1, size - 1)
+            a, b, c, d = columns[i], columns[k], columns[j], columns[m]
+            ac, ad, bc, bd = 0.0, 0.0, 0.0, 0.0
+            for n in range(columns.shape[1]):
+                ac += a[n] * c[n]
+                ad += a[n] * d[n]
+                bc += b[n] * c[n]
+                bd += b[n] * d[n]
+            products[i, j], products[i, m], products[k, j], products[k, m] = ac, ad, bc, bd
+            products[j, i], products[m, i], products[j, k], products[m, k] = ac, ad, bc, bd
     return products
 
 

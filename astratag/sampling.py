@@ -36,7 +36,7 @@ def sample(image: Brightness, points_px: Places) -> Array:
 
 
 @compiled(REAL, REAL)
-def _within(x: float, last: float) -> float:
+def within(x: float, last: float) -> float:
     """Return the number from 0 to ``last`` that is nearest; 0 for what is none."""
     x = x if x > 0.0 else 0.0
     return x if x < last else last
@@ -50,7 +50,7 @@ def _around(
 
     Without branches; indices are unsigned, for such are not looked at for being negative.
     """
-    x, y = _within(x, width - 1.0), _within(y, height - 1.0)
+    x, y = within(x, width - 1.0), within(y, height - 1.0)
     left, top = int(x), int(y)
     column, row = np.uint64(left), np.uint64(top)
     next_column, next_row = np.uint64(min(left + 1, width - 1)), np.uint64(min(top + 1, height - 1))
@@ -77,8 +77,8 @@ def light_between(gray: NDArray[np.uint8], of_gray: Array, x: float, y: float) -
 @compiled(REAL, REAL, INT, INT)
 def fading(x: float, y: float, height: int, width: int) -> float:
     """Return 1 within an image, and how that falls to 0 within a pixel beyond."""
-    across = _within(x + 1, 1.0) * _within(width - x, 1.0)
-    return across * _within(y + 1, 1.0) * _within(height - y, 1.0)
+    across = within(x + 1, 1.0) * within(width - x, 1.0)
+    return across * within(y + 1, 1.0) * within(height - y, 1.0)
 
 
 @compiled(BRIGHTNESS, REAL, REAL)

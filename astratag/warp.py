@@ -50,7 +50,7 @@ class FittedWarp(Protocol):
         ...
 
     def slopes(self, template: Array, along: Array) -> Array:
-        """Return d pixels / d parameters along unit vectors (2, N): (P, N), at template points (N, 2)."""
+        """Return d pixels / d parameters along image vectors (2, N): (P, N), at template points (N, 2)."""
         ...
 
     def stepped(self, delta: Array) -> Self:
@@ -69,6 +69,13 @@ class FittedWarp(Protocol):
 def _listed(template: Array) -> Array:
     """Return template points (..., 2) as a list (N, 2) in C order."""
     return np.ascontiguousarray(template, dtype=float).reshape(-1, 2)
+
+
+def along_both_axes(warp: FittedWarp, template: Array) -> Array:
+    """Return d pixels / d parameters (N, 2, P) at template points (N, 2), from its slopes along rows and columns."""
+    axes = np.zeros((2, 2, len(template)))
+    axes[0, 0] = axes[1, 1] = 1.0
+    return np.stack([warp.slopes(template, along).T for along in axes], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,11 +100,11 @@ class HomographyWarp:
 
     def jacobian(self, template: Array) -> Array:
         """Return the derivative (N, 2, 8) by the first eight entries of H."""
-        return _plane_jacobian(_listed(template), self.H)
+        return along_both_axes(self, template)
 
     def slopes(self, template: Array, along: Array) -> Array:
-        """Return the derivative (8, N) along unit vectors (2, N) by the first eight entries of H."""
-        return slopes_of(_plane_jacobian(_listed(template), self.H), np.ascontiguousarray(along))
+        """Return the derivative (8, N) along image vectors (2, N) by the first eight entries of H."""
+        return _plane_slopes(_listed(template), self.H, np.ascontiguousarray(along))
 
     def stepped(self, delta: Array) -> HomographyWarp:
         """Return H + delta."""
@@ -129,15 +136,12 @@ class BentWarp:
 
     def jacobian(self, template: Array) -> Array:
         """Return the derivative (N, 2, 14): eight of the homography, then the bend by rows."""
-        points = _listed(template)
-        J = np.zeros((len(points), 2, 14))
-        J[:, :, :8] = _plane_jacobian(points, self.flat.H)
-        J[:, 0, 8:11] = J[:, 1, 11:14] = _bend_terms(points)
-        return J
+        return along_both_axes(self, template)
 
     def slopes(self, template: Array, along: Array) -> Array:
-        """Return the derivative (14, N) along unit vectors (2, N)."""
-        return slopes_of(self.jacobian(template), np.ascontiguousarray(along))
+        """Return the derivative (14, N) along image vectors (2, N)."""
+        terms = _bend_terms(_listed(template)).T
+        return np.concatenate([self.flat.slopes(template, along), along[0] * terms, along[1] * terms])
 
     def stepped(self, delta: Array) -> BentWarp:
         """Return both parts moved."""
@@ -217,7 +221,7 @@ class PoseWarp:
         return pose_jacobian(self._marker(template)[0], self.T_cam_marker, self.camera.lens)
 
     def slopes(self, template: Array, along: Array) -> Array:
-        """Return the derivative (6, N) along unit vectors (2, N)."""
+        """Return the derivative (6, N) along image vectors (2, N)."""
         along = np.ascontiguousarray(along)
         return _pose_slopes(self._marker(template)[0], self.T_cam_marker, self.camera.lens, along)
 
@@ -315,21 +319,20 @@ def _through_plane(template: Array, H: Array) -> Array:
     return at
 
 
-@compiled(MATRIX, MATRIX)
-def _plane_jacobian(template: Array, H: Array) -> Array:
-    """Return the derivative (N, 2, 8) of ``_through_plane`` by the first eight entries of H."""
-    J = np.zeros((len(template), 2, 8))
+@compiled(MATRIX, MATRIX, MATRIX)
+def _plane_slopes(template: Array, H: Array, along: Array) -> Array:
+    """Return the derivative (8, N) of ``_through_plane`` along image vectors (2, N) by the first eight entries of H."""
+    slopes = np.empty((8, len(template)))
     for i in range(len(template)):
         u, v = template[i, 0] / (TEMPLATE_UNITS / 2) - 1.0, template[i, 1] / (TEMPLATE_UNITS / 2) - 1.0
         depth = max(H[2, 0] * u + H[2, 1] * v + H[2, 2], LEAST_DEPTH)
-        for axis in range(2):
-            at = (H[axis, 0] * u + H[axis, 1] * v + H[axis, 2]) / depth
-            J[i, axis, 3 * axis] = u / depth
-            J[i, axis, 3 * axis + 1] = v / depth
-            J[i, axis, 3 * axis + 2] = 1 / depth
-            J[i, axis, 6] = -at * u / depth
-            J[i, axis, 7] = -at * v / depth
-    return J
+        x, y = (H[0, 0] * u + H[0, 1] * v + H[0, 2]) / depth, (H[1, 0] * u + H[1, 1] * v + H[1, 2]) / depth
+        right, down = along[0, i] / depth, along[1, i] / depth
+        nearer = -(x * right + y * down)
+        slopes[0, i], slopes[1, i], slopes[2, i] = right * u, right * v, right
+        slopes[3, i], slopes[4, i], slopes[5, i] = down * u, down * v, down
+        slopes[6, i], slopes[7, i] = nearer * u, nearer * v
+    return slopes
 
 
 @compiled(MATRIX)
@@ -340,16 +343,6 @@ def _bend_terms(template: Array) -> Array:
         u, v = template[i, 0] / (TEMPLATE_UNITS / 2) - 1.0, template[i, 1] / (TEMPLATE_UNITS / 2) - 1.0
         terms[i, 0], terms[i, 1], terms[i, 2] = u * u, u * v, v * v
     return terms
-
-
-@compiled(CUBE, MATRIX)
-def slopes_of(J: Array, along: Array) -> Array:
-    """Return derivatives (N, 2, P) along unit vectors (2, N): (P, N)."""
-    slopes = np.empty((J.shape[2], J.shape[0]))
-    for p in range(J.shape[2]):
-        for i in range(J.shape[0]):
-            slopes[p, i] = along[0, i] * J[i, 0, p] + along[1, i] * J[i, 1, p]
-    return slopes
 
 
 @compiled(MATRIX, REAL, REAL, REAL)
