@@ -23,6 +23,7 @@ from astratag.compiled import (
     INTO_MARKS,
     INTO_POINTS,
     INTO_SHAPES,
+    INTO_STARTS,
     MATRIX,
     REAL,
     TABLE,
@@ -37,6 +38,8 @@ Indices = NDArray[np.int64]
 
 MOST_REACH_PX = 15
 """How far from a pixel the widest window reaches."""
+COUNTED_ROWS = 4
+"""Of so many rows one is looked at for how often neighbours differ, which takes as long as telling ink from paper."""
 INK, SEEN, BEFORE_PAPER = 1, 2, 4
 """What pixels of a shape are marked with, added up: on a border that was followed; on one with paper to its right."""
 WORD = 8
@@ -44,8 +47,10 @@ WORD = 8
 ALL_INK = np.uint64(0x0101010101010101)
 A_PIXEL, LAST_OF_WORD = np.uint64(8), np.uint64(56)
 """By how many bits a word is shifted to move its pixels on by one, and its last one to the front."""
-ROOM = 4096
-"""Points that there is room for at first."""
+ROOM, PIXELS_A_POINT = 4096, 8
+"""Points that there is room for at first, or one for so many pixels, if that is more."""
+LEAST_POINTS = 4
+"""Borders that turn less often are no squares."""
 ACROSS, DOWN = np.array([(1, 1, 0, -1, -1, -1, 0, 1), (0, -1, -1, -1, 0, 1, 1, 1)])
 """Steps to the eight neighbours of a pixel, counter-clockwise in the image from the right one."""
 
@@ -165,7 +170,7 @@ def threshold_blocks(
 
     As OpenCV's ``adaptiveThreshold``, in blocks of ``block_px`` that are ``worth`` it (R, C), and 0 elsewhere; with a
     border of 0 around it (H + 2, W + 2 or a few more).  ``sums`` are of ``sums_of``.  Second, how often neighbours in a
-    row differ.
+    row differ, about: counted in every fourth row.
     """
     height, width = gray.shape
     shapes = np.zeros((height + 2, -(-(width + 2) // WORD) * WORD), dtype=np.uint8)
@@ -188,10 +193,11 @@ def threshold_blocks(
             for x in range(count):
                 total = np.float32(np.int32(d[x] - c[x] - b[x] + a[x]))
                 shape[x] = np.uint8(np.float32(level[x]) * area + apart - half <= total)
-        for x in range(1, count):
-            changes += shape[x] != shape[x - 1]
-        changes += (left > 0 and shape[0] != 0) + (right < width and shape[count - 1] != 0)
-    return shapes, changes
+        if y % COUNTED_ROWS == 0:
+            for x in range(1, count):
+                changes += shape[x] != shape[x - 1]
+            changes += (left > 0 and shape[0] != 0) + (right < width and shape[count - 1] != 0)
+    return shapes, COUNTED_ROWS * changes
 
 
 @compiled(GRAY, TABLE, FLAG_MATRIX, FLAG_MATRIX, INT, INT, INT, BOOL)
@@ -243,9 +249,26 @@ def threshold_enlarged(
             for x in range(count):
                 shape[2 * x] = rest * between[x + 1] + quarter * between[x] > 0
                 shape[2 * x + 1] = rest * between[x + 1] + quarter * between[x + 2] > 0
-            for x in range(1, 2 * count):
-                changes += shape[x] != shape[x - 1]
-    return shapes, changes
+            if half == 0 and y % (COUNTED_ROWS // 2) == 0:
+                for x in range(1, 2 * count):
+                    changes += shape[x] != shape[x - 1]
+    return shapes, COUNTED_ROWS * changes
+
+
+@compiled(GRAY, INT)
+def largest_in_blocks(image: Image, block_px: int) -> Image:
+    """Return the largest value in each block (R, C) of an image (H, W)."""
+    height, width = image.shape
+    largest = np.zeros((-(-height // block_px), -(-width // block_px)), dtype=np.uint8)
+    for row in range(len(largest)):
+        below = np.zeros(width, dtype=np.uint8)
+        for y in range(row * block_px, min((row + 1) * block_px, height)):
+            for x in range(width):
+                below[x] = max(below[x], image[y, x])
+        for column in range(largest.shape[1]):
+            for x in range(column * block_px, min((column + 1) * block_px, width)):
+                largest[row, column] = max(largest[row, column], below[x])
+    return largest
 
 
 @compiled(GRAY, INDEX_MATRIX)
@@ -296,7 +319,7 @@ def _next_border(words: NDArray[np.uint64], at: int, stop: int) -> int:
     return stop
 
 
-@compiled(INTO_MARKS, INTO_MARKS, INT, INT, INT, INDICES, INTO_POINTS, INT)
+@compiled(INTO_MARKS, INTO_MARKS, INT, INT, INT, INDICES, INDICES, INTO_POINTS, INT)
 def _followed(
     marks: NDArray[np.uint8],
     around: NDArray[np.uint8],
@@ -304,13 +327,15 @@ def _followed(
     y: int,
     x: int,
     steps: Indices,
-    points: Array,
+    onward_steps: Indices,
+    points: NDArray[np.int32],
     end: int,
 ) -> tuple[int, int, int, int]:
     """Follow the border that begins at a pixel, and write where it turns into ``points`` (N, 2) from ``end`` on.
 
     Return how many points it has, which may be more than there is room for, twice its area, and its straight and
-    slanted steps.  ``marks`` and ``around`` are of all pixels; ``steps`` (8,) take from one to its neighbours.
+    slanted steps.  ``marks`` and ``around`` are of all pixels; ``steps`` (8,) take from one to its neighbours, and
+    ``onward_steps`` (2048,) to where ``TURNS`` go: looked up at once, for each pixel waits for the one before.
     """
     of_hole = marks[start] == 0  # which begins at the paper after its ink
     x -= of_hole
@@ -327,7 +352,8 @@ def _followed(
     here, came_from, straight_on = first, onwards, onwards ^ np.uint64(4)
     count, last, doubled, taken, slanted = end, len(points) - 1, 0, 0, 0
     while True:
-        turn = np.uint64(TURNS[np.uint64(around[here]) << np.uint64(3) | came_from])
+        way = np.uint64(around[here]) << np.uint64(3) | came_from
+        turn, following = np.uint64(TURNS[way]), np.uint64(np.int64(here) + onward_steps[way])
         onwards = turn & np.uint64(7)
         marks[here] |= np.uint8(turn >> np.uint64(3))
         at = np.uint64(min(count, last))
@@ -340,10 +366,48 @@ def _followed(
         taken += 1
         x += ACROSS[onwards]
         y += DOWN[onwards]
-        following = np.uint64(np.int64(here) + steps[onwards])
         if following == first and here == second:
             return count - end, doubled, taken - slanted, slanted
         here, came_from = following, onwards ^ np.uint64(4)
+
+
+@compiled(INTO_MARKS, INTO_MARKS, INDEX_MATRIX, INT, REAL, INTO_POINTS, INTO_STARTS)
+def _traced(
+    marks: NDArray[np.uint8],
+    around: NDArray[np.uint8],
+    spans: Indices,
+    width: int,
+    least_px: float,
+    points: NDArray[np.int32],
+    starts: Indices,
+) -> tuple[Array, Array, int]:
+    """Write the borders of shapes in spans into ``points`` (P, 2) and ``starts`` (N,); see ``traced``.
+
+    Return areas and perimeters, and how many pixels all borders have: -1 when there was no room for all points.
+    """
+    words = marks.view(np.uint64)
+    areas, perimeters = np.empty(len(starts)), np.empty(len(starts))
+    end, count, followed = 0, 0, 0
+    steps, onward_steps = DOWN * width + ACROSS, np.empty(len(TURNS), dtype=np.int64)
+    for way in range(len(TURNS)):
+        onward_steps[way] = steps[TURNS[way] & 7]
+    for y, first, stop in spans:
+        row, stop = y * width, stop + y * width + 1
+        at = _next_border(words, row + first, stop)
+        while at < stop:
+            length, doubled, straight, slanted = _followed(
+                marks, around, at, y, at - row, steps, onward_steps, points, end
+            )
+            if end + length >= len(points):
+                return areas, perimeters, -1
+            followed += straight + slanted
+            perimeter = straight + slanted * math.sqrt(2.0)
+            if length >= LEAST_POINTS and perimeter >= least_px:
+                areas[count], perimeters[count] = doubled / 2, perimeter
+                end, count = end + length, count + 1
+                starts[count] = end
+            at = _next_border(words, at + 1, stop)
+    return areas[:count].copy(), perimeters[:count].copy(), followed
 
 
 @compiled(INTO_SHAPES, FLAG_MATRIX, INT, REAL)
@@ -358,29 +422,13 @@ def traced(shapes: Image, worth: Flags, block_px: int, least_px: float) -> tuple
     height, width = shapes.shape
     spans = _spans(worth, block_px, height - 2, width - 2)
     marks, around = shapes.ravel(), _neighbours(shapes, spans).ravel()
-    words = marks.view(np.uint64)
-    points, starts = np.empty((ROOM, 2)), np.zeros(ROOM, dtype=np.int64)
-    areas, perimeters = np.empty(ROOM), np.empty(ROOM)
-    end, count, followed = 0, 0, 0
-    steps = DOWN * width + ACROSS
-    for i in range(len(spans)):
-        y, first, stop = spans[i]
-        stop += y * width + 1
-        at = _next_border(words, y * width + first, stop)
-        while at < stop:
-            length, doubled, straight, slanted = _followed(marks, around, at, y, at - y * width, steps, points, end)
-            followed += straight + slanted
-            perimeter = straight + slanted * math.sqrt(2.0)
-            if length >= 4 and perimeter >= least_px:
-                if end + length >= len(points):
-                    points = np.concatenate((points[:end], np.empty((end + 2 * length, 2))))
-                    _followed(marks, around, at, y, at - y * width, steps, points, end)
-                if count + 1 == len(starts):
-                    starts = np.concatenate((starts, np.zeros_like(starts)))
-                    areas = np.concatenate((areas, np.empty_like(areas)))
-                    perimeters = np.concatenate((perimeters, np.empty_like(perimeters)))
-                areas[count], perimeters[count] = doubled / 2, perimeter
-                end, count = end + length, count + 1
-                starts[count] = end
-            at = _next_border(words, at + 1, stop)
-    return points[:end].copy(), starts[: count + 1].copy(), areas[:count].copy(), perimeters[:count].copy(), followed
+    room = max(ROOM, shapes.size // PIXELS_A_POINT)
+    while True:
+        points, starts = np.empty((room, 2), dtype=np.int32), np.zeros(room // LEAST_POINTS + 1, dtype=np.int64)
+        areas, perimeters, followed = _traced(marks, around, spans, width, least_px, points, starts)
+        if followed >= 0:
+            starts = starts[: len(areas) + 1].copy()
+            return points[: starts[-1]].astype(np.float64), starts, areas, perimeters, followed
+        room *= 2
+        for pixel in range(len(marks)):
+            marks[pixel] &= INK

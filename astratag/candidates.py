@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from astratag.align import COARSE_BLUR, COARSE_STEPS, FINE_STEPS, align
-from astratag.compiled import CUBE, GRAY, INT, MATRIX, compiled
+from astratag.compiled import CUBE, MATRIX, compiled
+from astratag.frame import FRAME, darker_inside
 from astratag.geometry import LAYERS, TEMPLATE_UNITS, square
 from astratag.relight import RELIT_SAMPLES, relit_cells
-from astratag.sampling import bilinear
 from astratag.search import BentQuads
 from astratag.signature import (
     CELL_MIDDLES,
@@ -62,8 +62,6 @@ MAX_BENT = 3
 MAX_BENT_READ, MAX_SHIFTS_READ = 4, 6
 LEAST_BENT_SIDE_PX = 16.0
 LEAST_FRAMED, LEAST_FRAMED_RELIT = 3, 2
-LEAST_STEP_GREY = 4.0
-"""How much brighter the surroundings of a square must be than its border, on average."""
 OUTER = square(0.0, TEMPLATE_UNITS)
 OUTER.flags.writeable = False
 
@@ -146,35 +144,6 @@ def relit_candidates(light: NDArray[np.float32], quads: Array, codebook: Codeboo
 def framed(gray: Image, quads: Array, least: int = LEAST_FRAMED) -> Array:
     """Return those of quads (Q, 4, 2) that are darker inside their edges than outside, on at least so many sides."""
     return quads[darker_inside(gray, points_in(quads, FRAME), least)] if len(quads) else quads
-
-
-@compiled(GRAY, CUBE, INT)
-def darker_inside(gray: Image, at_px: Array, least: int) -> NDArray[np.bool_]:
-    """Return which squares are darker inside than outside on so many sides, where ``FRAME`` lies (Q, F, 2) in them."""
-    count, along = len(at_px), at_px.shape[1] // 8
-    darker = np.empty(count, dtype=np.bool_)
-    for q in range(count):
-        sides = 0
-        for side in range(4):
-            step = 0.0
-            for i in range(side * along, (side + 1) * along):
-                inside = at_px[q, 4 * along + i]
-                step += bilinear(gray, at_px[q, i, 0], at_px[q, i, 1]) - bilinear(gray, inside[0], inside[1])
-            sides += step >= LEAST_STEP_GREY * along
-        darker[q] = sides >= least
-    return darker
-
-
-def _frame_points() -> Array:
-    """Return points outside and inside each side of the template's square (2 x 4 x 5, 2)."""
-    along = np.linspace(0.1, 0.9, 5)
-    across = np.array([-0.06, 0.035])[:, None] * np.ones(5)
-    top = np.stack([np.broadcast_to(along, across.shape), across], axis=2)
-    sides = [top, top[..., ::-1] * (-1, 1) + (1, 0), top * (1, -1) + (0, 1), top[..., ::-1]]
-    return np.stack(sides, axis=1).reshape(-1, 2) * TEMPLATE_UNITS
-
-
-FRAME = _frame_points()
 
 
 @compiled(CUBE, MATRIX)

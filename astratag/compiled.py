@@ -48,10 +48,11 @@ INDICES, INDEX_MATRIX = array(INT, 1), array(INT, 2)
 BITS = array(types.uint8, 2)
 TABLE = array(types.int32, 2)
 """All in C order, and only read."""
-INTO_SHAPES, INTO_POINTS = types.Array(types.uint8, 2, "C"), types.Array(REAL, 2, "C")
-"""Shapes (H, W) and points (N, 2) that are written to as well."""
-INTO_VECTOR, INTO_INDICES = types.Array(REAL, 1, "C"), types.Array(INT, 2, "C")
-"""Numbers (N,) and indices (N, M), likewise."""
+INTO_SHAPES, INTO_POINTS = types.Array(types.uint8, 2, "C"), types.Array(types.int32, 2, "C")
+"""Shapes (H, W) and pixels (N, 2) that are written to as well."""
+INTO_VECTOR, INTO_MATRIX = types.Array(REAL, 1, "C"), types.Array(REAL, 2, "C")
+INTO_STARTS, INTO_INDICES = types.Array(INT, 1, "C"), types.Array(INT, 2, "C")
+"""Numbers (N,) and (N, M), and indices, likewise."""
 INTO_MARKS, WORDS = types.Array(types.uint8, 1, "C"), types.Array(types.uint64, 1, "C")
 """Shapes row by row (H W,), a pixel at once and eight."""
 PLACES = (MATRIX, array(SINGLE, 2))

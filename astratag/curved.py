@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from astratag.align import COARSE_BLUR, COARSE_STEPS, FINE_STEPS, align
 from astratag.camera import Camera
-from astratag.candidates import FRAME, LEAST_FRAMED, OUTER, Candidate, darker_inside
+from astratag.candidates import LEAST_FRAMED, OUTER, Candidate
 from astratag.codes import Reading
 from astratag.codes.acceptance import chance_of_correlation
 from astratag.codes.soft import correlations, hamming
-from astratag.compiled import INDICES, MATRIX, REAL, compiled
+from astratag.compiled import INDICES, MATRIX, REAL, VECTOR, compiled
 from astratag.cylinder import Bent, CylinderWarp, bent_through
 from astratag.detection import LayerDetection
 from astratag.fit import fit_edges
@@ -49,7 +49,7 @@ W = TypeVar("W", bound=FittedWarp)
 
 LEAST_SIDE_PX = 24.0
 """Smaller squares do not show a bend."""
-PROMISING, MAX_CANDIDATES, MAX_READ, MAX_GLANCED_AT = 0.44, 4, 8, 200
+PROMISING, MAX_CANDIDATES, MAX_READ, MAX_GLANCED_AT = 0.44, 4, 5, 200
 """Correlation from which a bent square is worth a look; at most so many are moved, of so many read.
 
 Of so many whose cells are glanced at, the likeliest: of 56 bent prints that were found, all were among the first 3.
@@ -108,7 +108,12 @@ def near_sides(outlines: Outlines) -> Array:
     """
     others, scale = outlines.others, outlines.scale
     sides, lengths = _near_sides(
-        others.points, others.starts, NEAR_TOLERANCE_PX / scale, LEAST_NEAR_PX / scale, LEAST_BESIDE_PX / scale
+        others.points,
+        others.starts,
+        others.perimeters,
+        NEAR_TOLERANCE_PX / scale,
+        LEAST_NEAR_PX / scale,
+        LEAST_BESIDE_PX / scale,
     )
     longest = np.argsort(-lengths, kind="stable")[:MAX_NEAR]
     along = (sides[longest, 1] - sides[longest, 0]) / lengths[longest, None]
@@ -117,18 +122,24 @@ def near_sides(outlines: Outlines) -> Array:
     return outlines.in_image(sides[longest] + outset)
 
 
-@compiled(MATRIX, INDICES, REAL, REAL, REAL)
+@compiled(MATRIX, INDICES, VECTOR, REAL, REAL, REAL)
 def _near_sides(
-    points: Array, starts: NDArray[np.int64], tolerance: float, least_near: float, least_beside: float
+    points: Array,
+    starts: NDArray[np.int64],
+    perimeters: Array,
+    tolerance: float,
+    least_near: float,
+    least_beside: float,
 ) -> tuple[Array, Array]:
     """Return sides (Q, 2, 2) of contours, simplified, that lie between two corners, and how long they are (Q,).
 
-    Contour i runs counter-clockwise in the image through ``points`` (P, 2) from ``starts`` (N + 1,) i on.
+    Contour i runs counter-clockwise in the image through ``points`` (P, 2) from ``starts`` (N + 1,) i on, as long as
+    its perimeter (N,).
     """
     sides, lengths, found = np.empty((len(points), 2, 2)), np.empty(len(points)), 0
     for i in range(len(starts) - 1):
         contour = points[starts[i] : starts[i + 1]]
-        if max(np.ptp(contour[:, 0]), np.ptp(contour[:, 1])) < least_near:
+        if perimeters[i] < 2 * least_near or max(np.ptp(contour[:, 0]), np.ptp(contour[:, 1])) < least_near:
             continue
         polygon = simplified(contour, tolerance, len(contour))[::-1]
         count = len(polygon)
@@ -156,8 +167,7 @@ def _near_sides(
 
 def curved_candidates(gray: Image, bent: Bent, codebook: Codebook, artwork: Artwork) -> list[Candidate]:
     """Return the bent squares that read and look something like a marker, the best about each place, the best first."""
-    at = bent.all
-    at = at[darker_inside(gray, bent.project(FRAME), LEAST_FRAMED)][:MAX_GLANCED_AT] if len(at) else at
+    at = bent.framed(gray, LEAST_FRAMED)[:MAX_GLANCED_AT]
     if len(at) == 0:
         return []
     middles_px, facing = bent.seen(CELL_MIDDLES, at)
@@ -220,16 +230,17 @@ def seen_whole(gray: Image, candidate: Candidate, side_m: float, codebook: Codeb
     for layer in np.argsort(-scores).tolist():
         if scores[layer] < max(LEAST_SCORE, scores.max() - UNCLEAR):
             break
-        moved = _aligned(gray, square, artwork, candidate.reading, layer, side_px)
-        if moved is None or np.abs(moved(OUTER) - square(OUTER)).max() > max(MOVED_PX, MOVED * side_px):
+        aligned = _aligned(gray, square, scores, artwork, candidate.reading, layer, side_px)
+        if aligned is None or np.abs(aligned.warp(OUTER) - square(OUTER)).max() > max(MOVED_PX, MOVED * side_px):
             continue
         if layer == INNERMOST:  # so small that it says little of the bend: go on with the next, where it must be
             layer -= 1
-            moved = moved.of_whole(1.0, LAYERS[INNERMOST].scale / LAYERS[layer].scale)
-            moved = _aligned(gray, moved, artwork, candidate.reading, layer, side_px)
-            if moved is None:
+            wider = aligned.warp.of_whole(1.0, LAYERS[INNERMOST].scale / LAYERS[layer].scale)
+            looks = artwork.layer_scores(gray, wider.facing, marker_id, side_px)
+            aligned = _aligned(gray, wider, looks, artwork, candidate.reading, layer, side_px)
+            if aligned is None:
                 continue
-        looks = artwork.layer_scores(gray, moved.facing, marker_id, side_px)
+        moved, looks = aligned
         if looks[layer] < LEAST_LOOKS or (layer == 0 and looks[0] < looks[1:].max() + CLEARLY_OUTERMOST):
             continue
         whole = moved.of_whole(side_m, LAYERS[layer].scale)
@@ -240,32 +251,34 @@ def seen_whole(gray: Image, candidate: Candidate, side_m: float, codebook: Codeb
     return None
 
 
+class Aligned(NamedTuple):
+    """A moved square, and how it looks (3,) as each layer."""
+
+    warp: CylinderWarp
+    looks: Array
+
+
 def _aligned(
-    gray: Image, warp: CylinderWarp, artwork: Artwork, reading: Reading, layer: int, side_px: float
-) -> CylinderWarp | None:
+    gray: Image, warp: CylinderWarp, looks: Array, artwork: Artwork, reading: Reading, layer: int, side_px: float
+) -> Aligned | None:
     """Return a square moved until what is in view of it looks like a layer of the marker it reads as; None if hopeless.
 
-    The first steps are taken on a coarser grid of points, which does as well on a blurred picture.  Where a blur makes
-    one of much that is seen at a slant they lead astray, and are taken back.
+    ``looks`` (3,) are as it is.  The first steps are taken on a coarser grid of points, which does as well on a blurred
+    picture.  Where a blur makes one of much that is seen at a slant they lead astray, and are taken back.
     """
     expected, points = artwork.expected(reading.marker_id, side_px)[layer], artwork.points
     coarse = np.arange(len(points)).reshape(artwork.GRID, -1)[::2, ::2].ravel()
-
-    def looks(warp: CylinderWarp) -> float:
-        return float(artwork.layer_scores(gray, warp.facing, reading.marker_id, side_px)[layer])
-
-    before = looks(warp)
     for blur, steps, among in ((COARSE_BLUR, COARSE_STEPS, coarse), (0.0, FINE_STEPS, artwork.half)):
         seen = among[warp.visible(points[among])]
         if len(seen) < LEAST_IN_VIEW * len(among):
             return None
         moved = align(gray, warp, points[seen], expected[seen], blur=blur, steps=steps)
-        after = looks(moved)
-        if after >= before:
-            warp, before = moved, after
-        if before < HOPELESS_LOOKS or reading.correlation + before / 2 < HOPELESS:
+        after = artwork.layer_scores(gray, moved.facing, reading.marker_id, side_px)
+        if after[layer] >= looks[layer]:
+            warp, looks = moved, after
+        if looks[layer] < HOPELESS_LOOKS or reading.correlation + looks[layer] / 2 < HOPELESS:
             return None
-    return warp
+    return Aligned(warp, looks)
 
 
 class LayerReading(NamedTuple):

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from astratag.camera import Camera, pixel, pixel_slope
 from astratag.compiled import CUBE, INT, MATRIX, REAL, VECTOR, array, compiled
+from astratag.frame import FRAME, bent_darker_inside
 from astratag.geometry import TEMPLATE_UNITS, print_from_template, square
 from astratag.surface import Cylinder
 from astratag.transforms import pose
@@ -91,7 +92,8 @@ class CylinderWarp:
     def facing(self, template: Array) -> Array:
         """Return pixels (N, 2) of template points (N, 2), those that do not face the viewer outside every image."""
         at, visible = self._seen(template)
-        return np.where(visible[:, None], at, OUTSIDE_PX)
+        at[~visible] = OUTSIDE_PX
+        return at
 
     def _seen(self, template: Array) -> tuple[Array, NDArray[np.bool_]]:
         surface, pose = self.surface, self.pose
@@ -216,6 +218,12 @@ class Bent:
         T = pose(self.rotation[place, model], self.translation[place, model])
         return CylinderWarp.of(self.camera, 1.0, self.curvature[model], self.axis_rad[model], T)
 
+    def framed(self, gray: NDArray[np.uint8], least: int) -> NDArray[np.int64]:
+        """Return the place and model (N, 2) of those that are darker inside than outside, on at least so many sides."""
+        frame, _ = _on_cylinders(print_from_template(FRAME, 1.0), self.curvature, self.axis_rad)
+        rotation, translation = np.ascontiguousarray(self.rotation), np.ascontiguousarray(self.translation)
+        return np.argwhere(bent_darker_inside(gray, frame, rotation, translation, self.camera.lens, NEAREST, least))
+
     def project(self, template: Array, which: NDArray[np.int64] | None = None) -> Array:
         """Return where template points (S, 2) lie in the image (N, S, 2) for those ``which`` (N, 2), or for ``all``."""
         return self.seen(template, which)[0]
@@ -233,6 +241,24 @@ class Bent:
         )
 
 
+@compiled(MATRIX, VECTOR, VECTOR)
+def _on_cylinders(on_print: Array, curvature: Array, axis_rad: Array) -> tuple[Array, Array]:
+    """Return where print points (S, 2) lie on each of M cylinders, and their outward normals, (M, S, 3)."""
+    count = len(on_print)
+    points, normals = np.empty((len(curvature), count, 3)), np.empty((len(curvature), count, 3))
+    for m in range(len(curvature)):
+        c, s, radius = math.cos(axis_rad[m]), math.sin(axis_rad[m]), 1 / curvature[m]
+        for i in range(count):
+            x, y = on_print[i]
+            along, angle = c * x + s * y, (c * y - s * x) / radius
+            sine, cosine = math.sin(angle), math.cos(angle)
+            points[m, i, 0] = c * along - s * radius * sine
+            points[m, i, 1] = s * along + c * radius * sine
+            points[m, i, 2] = radius * (cosine - 1)
+            normals[m, i, 0], normals[m, i, 1], normals[m, i, 2] = -s * sine, c * sine, cosine
+    return points, normals
+
+
 @compiled(MATRIX, VECTOR, VECTOR, array(REAL, 4), CUBE, array(INT, 2), VECTOR)
 def _project_bent(
     on_print: Array,
@@ -247,18 +273,8 @@ def _project_bent(
 
     Of the squares ``which`` (N, 2), place and model, of those that ``Bent`` describes.
     """
+    points, normals = _on_cylinders(on_print, curvature, axis_rad)
     count = len(on_print)
-    points, normals = np.empty((len(curvature), count, 3)), np.empty((len(curvature), count, 3))
-    for m in range(len(curvature)):
-        c, s, radius = math.cos(axis_rad[m]), math.sin(axis_rad[m]), 1 / curvature[m]
-        for i in range(count):
-            x, y = on_print[i]
-            along, angle = c * x + s * y, (c * y - s * x) / radius
-            sine, cosine = math.sin(angle), math.cos(angle)
-            points[m, i, 0] = c * along - s * radius * sine
-            points[m, i, 1] = s * along + c * radius * sine
-            points[m, i, 2] = radius * (cosine - 1)
-            normals[m, i, 0], normals[m, i, 1], normals[m, i, 2] = -s * sine, c * sine, cosine
     at, facing = np.empty((len(which), count, 2)), np.empty((len(which), count), dtype=np.bool_)
     for n in range(len(which)):
         q, m = which[n]

@@ -301,7 +301,9 @@ class Detector(Confirmer):
             if candidate.side_px < LEAST_CLOSE_PX:
                 continue
             by_edges = not candidate.bent and view.by_edges.take(candidate) and view.effort.begin(COST.edges)
-            if not (by_edges and take(candidate, self._confirm_edges(view, candidate))):
+            if by_edges and take(candidate, self._confirm_edges(view, candidate)):
+                view.by_edges.succeed()
+            else:
                 left.append(candidate)
         for candidate in [] if _sure(found) or quick else left[:MAX_ALIGNED_AT_ONCE]:
             if _inside_any(candidate.corners_px, found):
@@ -318,7 +320,12 @@ class Detector(Confirmer):
         curved = isinstance(candidate.warp, CylinderWarp)
         tries, units = (view.curved, COST.curved) if curved else (view.aligned, COST.aligned)
         spend = view.effort.begin if candidate.promise >= 0 else view.effort.spend
-        return self._confirm_aligned(view, candidate) if tries.take(candidate) and spend(units) else None
+        if not (tries.take(candidate) and spend(units)):
+            return None
+        found = self._confirm_aligned(view, candidate)
+        if found is not None:
+            tries.succeed()
+        return found
 
     def search_later(self, view: View) -> list[Detection]:
         """Return the first marker among the candidates that were not promising enough at once, the best first."""

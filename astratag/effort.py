@@ -16,9 +16,9 @@ SAME_SQUARE = 0.04
 """Squares whose centres and sides differ by less than this fraction are one square found twice."""
 BETTER = 0.03
 """A square that was looked at is looked at again where it reads so much better."""
-LEAST_UNITS, UNITS_A_PIXEL, MOST_UNITS, SHARE_OF_FLAT = 8_000, 0.0306, 18_000, 0.66
+LEAST_UNITS, UNITS_A_PIXEL, MOST_UNITS, SHARE_OF_FLAT = 7_000, 0.0291, 16_500, 0.69
 """What one image is worth whatever its size, and more for each pixel, up to a limit: what the hardest markers of the
-benchmark take, which at 640x480 is 17 000; and the share of that where every marker is known to be flat.  A plain one
+benchmark take, which at 640x480 is 16 000; and the share of that where every marker is known to be flat.  A plain one
 with a marker takes about a thousand.
 
 A unit is what takes about a microsecond, counted and never measured, so that the same image always gets the same.
@@ -56,24 +56,24 @@ class Costs:
 
     look: float = 300.0
     """One way of telling ink from paper, however small the picture."""
-    pixel: float = 0.0017
+    pixel: float = 0.0015
     """Of a picture in which outlines are looked for."""
     resized_pixel: float = 0.0002
     """More of the whole picture, at the resolution worked at."""
-    border_pixel: float = 0.012
+    border_pixel: float = 0.009
     """Of the borders of all shapes: followed, or looked through for near sides."""
-    outline: float = 5.0
+    outline: float = 4.5
     """Simplified, and read as if flat; or simplified as if bent."""
     edges: float = 150.0
-    aligned: float = 1500.0
+    aligned: float = 900.0
     bent: float = 1.3
     """A bent square whose frame is looked at."""
-    bent_read: float = 450.0
+    bent_read: float = 370.0
     """Those that have one, and how the best look."""
-    curved: float = 2100.0
+    curved: float = 1350.0
     relit: float = 34.0
     """A square read cell by cell."""
-    by_pixels: float = 250.0
+    by_pixels: float = 160.0
     matched: float = 1500.0
     spline: float = 190.0
 
@@ -82,7 +82,10 @@ COST = Costs()
 
 
 class Tries:
-    """The candidates of one image that were looked at in one costly way: each once, unless it reads better later."""
+    """The candidates of one image that were looked at in one costly way: each once, unless it reads better later.
+
+    Of those that come to nothing ``most`` are looked at.
+    """
 
     def __init__(self, most: int) -> None:
         self.most = most
@@ -94,6 +97,10 @@ class Tries:
             return False
         self.made.append(candidate)
         return True
+
+    def succeed(self) -> None:
+        """Tell that the one looked at last was a marker."""
+        self.most += 1
 
 
 def _no_better(candidate: Candidate, before: Candidate) -> bool:

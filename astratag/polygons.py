@@ -10,7 +10,19 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.compiled import BOOL, CUBE, INDICES, INT, INTO_INDICES, INTO_VECTOR, MATRIX, REAL, VECTOR, compiled
+from astratag.compiled import (
+    BOOL,
+    CUBE,
+    INDICES,
+    INT,
+    INTO_INDICES,
+    INTO_MATRIX,
+    INTO_VECTOR,
+    MATRIX,
+    REAL,
+    VECTOR,
+    compiled,
+)
 
 Array = NDArray[np.float64]
 
@@ -20,9 +32,9 @@ MOST_POINTS = 12
 """Contours that take more points than this, before those on nearly straight lines are left out, are no quads."""
 FARTHEST_ROUNDS = 3
 """How often the point farthest from the one before is looked for, to find two that are far apart."""
-BEGIN, END, AT, PARTS, COUNT = range(5)
+BEGIN, END, AT, PARTS, COUNT, STACK = range(6)
 """What is known of a part of a contour: from which of its points to which, where it leads farthest off a line, and its
-two parts; of the first, how many parts there are."""
+two parts; of the first, how many parts there are.  In the last column are those that are still to be looked at."""
 NOT_KNOWN = -1.0
 TINY = 1e-9
 LEAST_SINE = 0.1
@@ -54,13 +66,16 @@ def _shortest(quad: Array) -> float:
     return shortest
 
 
-@compiled(MATRIX, INT, REAL)
-def _cleaned(polygon: Array, count: int, squared: float) -> Array:
-    """Return the first ``count`` points of a polygon (N, 2) without those nearly on the line of their neighbours."""
-    kept, left = polygon[:count].copy(), count
+@compiled(INTO_MATRIX, INT, REAL)
+def _cleaned(kept: Array, count: int, squared: float) -> int:
+    """Leave points nearly on the line of their neighbours out of the first ``count`` of a polygon (N, 2).
+
+    Return how many are left, which are the first then.
+    """
+    left = count
     before, write, read = count - 1, 0, 1 % count
-    sx, sy = polygon[before]
-    x, y = polygon[0]
+    sx, sy = kept[before]
+    x, y = kept[0]
     i = 0
     while i < count and left > 2:
         ex, ey = kept[read]
@@ -81,7 +96,7 @@ def _cleaned(polygon: Array, count: int, squared: float) -> Array:
             x, y = ex, ey
             i += 1
         write = (write + 1) % count
-    return kept[:left].copy()
+    return left
 
 
 @compiled(MATRIX)
@@ -114,10 +129,10 @@ def _farthest_off(contour: Array, begin: int, end: int) -> tuple[float, int]:
     return off, at
 
 
-@compiled(INT)
-def _no_splits(points: int) -> tuple[NDArray[np.int64], Array]:
-    """Return room for how a contour of so many points is split; see ``_simplified``."""
-    return np.empty((2 * points + 4, 5), dtype=np.int64), np.empty(2 * points + 4)
+@compiled(INT, INT)
+def _no_splits(points: int, most: int) -> tuple[NDArray[np.int64], Array, Array]:
+    """Return room for how a contour of so many points is split, and for a polygon of ``most``; see ``_simplified``."""
+    return np.empty((2 * points + 4, 6), dtype=np.int64), np.empty(2 * points + 4), np.empty((most + 1, 2))
 
 
 @compiled(INT, INT, INTO_INDICES, INTO_VECTOR)
@@ -129,19 +144,19 @@ def _begin_splits(start: int, other: int, splits: NDArray[np.int64], off: Array)
     splits[0, COUNT] = 2
 
 
-@compiled(MATRIX, INTO_INDICES, INTO_VECTOR, REAL, INT)
-def _simplified(contour: Array, splits: NDArray[np.int64], off: Array, tolerance: float, most: int) -> Array:
-    """Return ``simplified`` of a contour (N, 2), split further where that is needed.
+@compiled(MATRIX, INTO_INDICES, INTO_VECTOR, INTO_MATRIX, REAL)
+def _simplified(contour: Array, splits: NDArray[np.int64], off: Array, polygon: Array, tolerance: float) -> int:
+    """Write what ``simplified`` returns of a contour (N, 2) into a polygon (M + 1, 2); return how many points it has.
 
-    Where it is split does not depend on the tolerance: what was found out at one serves the next.  Part k leads ``off``
-    (K,) k, times its length, off a straight line, at a point; it is split there into two parts from ``PARTS`` on.
+    Where it is split does not depend on the tolerance: what was found out at one serves the next, and it is split
+    further where that is needed.  Part k leads ``off`` (K,) k, times its length, off a straight line, at a point; it is
+    split there into two parts from ``PARTS`` on.  Room is given by the caller, for there are hundreds of contours.
     """
-    polygon, stack = np.empty((most + 1, 2)), np.empty(len(contour) + 2, dtype=np.int64)
-    stack[0], stack[1] = 1, 0
+    splits[0, STACK], splits[1, STACK] = 1, 0
     top, size = 2, 0
     while top > 0:
         top -= 1
-        k = stack[top]
+        k = splits[top, STACK]
         begin, end = splits[k, BEGIN], splits[k, END]
         if off[k] == NOT_KNOWN:
             off[k], splits[k, AT] = _farthest_off(contour, begin, end)
@@ -150,8 +165,8 @@ def _simplified(contour: Array, splits: NDArray[np.int64], off: Array, tolerance
         if off[k] * off[k] <= tolerance * tolerance * (dx * dx + dy * dy):
             polygon[size, 0], polygon[size, 1] = x, y
             size += 1
-            if size > most:
-                return polygon
+            if size == len(polygon):
+                return size
             continue
         parts = splits[k, PARTS]
         if parts == 0:
@@ -160,7 +175,7 @@ def _simplified(contour: Array, splits: NDArray[np.int64], off: Array, tolerance
             splits[parts, BEGIN], splits[parts, END], splits[parts, PARTS] = begin, at, 0
             splits[parts + 1, BEGIN], splits[parts + 1, END], splits[parts + 1, PARTS] = at, end, 0
             off[parts] = off[parts + 1] = NOT_KNOWN
-        stack[top], stack[top + 1] = parts + 1, parts
+        splits[top, STACK], splits[top + 1, STACK] = parts + 1, parts
         top += 2
     return _cleaned(polygon, size, tolerance * tolerance)
 
@@ -177,9 +192,9 @@ def simplified(contour: Array, tolerance: float, most: int) -> Array:
     start, other, squared = _far_apart(contour)
     if squared <= tolerance * tolerance:
         return contour[start : start + 1].copy()
-    splits, off = _no_splits(len(contour))
+    splits, off, polygon = _no_splits(len(contour), most)
     _begin_splits(start, other, splits, off)
-    return _simplified(contour, splits, off, tolerance, most)
+    return polygon[: _simplified(contour, splits, off, polygon, tolerance)]
 
 
 @compiled(MATRIX)
@@ -223,30 +238,39 @@ def _length(polygon: Array) -> float:
     return length
 
 
-@compiled(MATRIX, REAL, VECTOR, BOOL, INTO_INDICES, INTO_VECTOR)
+@compiled(MATRIX, REAL, VECTOR, BOOL, INTO_INDICES, INTO_VECTOR, INTO_MATRIX, INTO_MATRIX)
 def _convex_quad(
-    contour: Array, perimeter: float, tolerances: Array, whole: bool, splits: NDArray[np.int64], off: Array
-) -> Array:
-    """Return the convex quad (4, 2) that a contour (N, 2) simplifies to, else an empty one (0, 2); see below."""
-    best, finest, too_fine, too_coarse = np.empty((0, 2)), np.inf, 0.0, np.inf
+    contour: Array,
+    perimeter: float,
+    tolerances: Array,
+    whole: bool,
+    splits: NDArray[np.int64],
+    off: Array,
+    polygon: Array,
+    best: Array,
+) -> bool:
+    """Return whether a contour (N, 2) simplifies to a convex quad, and write it into ``best`` (4, 2); see below."""
+    finest, too_fine, too_coarse = np.inf, 0.0, np.inf
     start, other, _ = _far_apart(contour)
     _begin_splits(start, other, splits, off)
     for tolerance in tolerances:
         if not too_fine < tolerance < too_coarse:
             continue
-        polygon = _simplified(contour, splits, off, tolerance * perimeter, MOST_POINTS)
-        if len(polygon) > MOST_POINTS:
+        count = _simplified(contour, splits, off, polygon, tolerance * perimeter)
+        if count > MOST_POINTS:
             too_fine = tolerance
-        elif len(polygon) < 4:
+        elif count < 4:
             too_coarse = tolerance
-        if len(polygon) != 4 or not _convex(polygon):
+        quad = polygon[:4]
+        if count != 4 or not _convex(quad):
             continue
-        bearable = whole or _shortest(polygon) >= TOLERANCES_A_SIDE * tolerance * perimeter
+        bearable = whole or _shortest(quad) >= TOLERANCES_A_SIDE * tolerance * perimeter
         if bearable or tolerance < finest:
-            best, finest = polygon, tolerance
+            best[:] = quad
+            finest = tolerance
         if bearable:
             break
-    return best
+    return finest < np.inf
 
 
 @compiled(MATRIX, INDICES, VECTOR, VECTOR, BOOL, INT)
@@ -262,17 +286,15 @@ def convex_quads(
     """
     count = len(perimeters)
     found, quads, hulls = np.zeros(count, dtype=np.bool_), np.zeros((count, 4, 2)), 0
-    splits, off = _no_splits(np.diff(starts).max() if count > 0 else 0)
+    splits, off, polygon = _no_splits(np.diff(starts).max() if count > 0 else 0, MOST_POINTS)
     for i in range(count):
         contour = points[starts[i] : starts[i + 1]]
-        quad = _convex_quad(contour, perimeters[i], tolerances, whole, splits, off)
-        if len(quad) == 0 and hulls < most_hulls:
+        found[i] = _convex_quad(contour, perimeters[i], tolerances, whole, splits, off, polygon, quads[i])
+        if not found[i] and hulls < most_hulls:
             hulls += 1
             around = hull(contour)
             if 4 <= len(around) < len(contour):
-                quad = _convex_quad(around, _length(around), tolerances, whole, splits, off)
-        if len(quad) > 0:
-            found[i], quads[i] = True, quad
+                found[i] = _convex_quad(around, _length(around), tolerances, whole, splits, off, polygon, quads[i])
     return found, quads
 
 

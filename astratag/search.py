@@ -13,7 +13,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.binarise import NO_CONTOURS, Contours, sums_of, threshold_blocks, threshold_enlarged, traced
+from astratag.binarise import (
+    NO_CONTOURS,
+    Contours,
+    largest_in_blocks,
+    sums_of,
+    threshold_blocks,
+    threshold_enlarged,
+    traced,
+)
 from astratag.polygons import bent_quads, clockwise, convex_quads, uncut_quads
 
 Array = NDArray[np.float64]
@@ -215,16 +223,11 @@ def _worth_a_fine_look(gray: Image) -> NDArray[np.bool_] | None:
     """Return which blocks (R, C) of an image (H, W) are worth enlarging, ``FINE_PX`` at most; None when all are."""
     if gray.size <= FINE_PX:
         return None
-    rows, columns = (-(-extent // BLOCK_PX) for extent in gray.shape)
     step = cv2.morphologyEx(gray, cv2.MORPH_GRADIENT, np.ones((STEP_PX, STEP_PX), np.uint8))
-    step = cv2.copyMakeBorder(
-        step, 0, rows * BLOCK_PX - len(gray), 0, columns * BLOCK_PX - gray.shape[1], cv2.BORDER_CONSTANT
-    )
-    largest = step.reshape(rows, BLOCK_PX, -1).max(axis=1).reshape(rows, columns, BLOCK_PX).max(axis=2)
-    near = cv2.dilate(largest, np.ones((3, 3), np.uint8))
+    near = cv2.dilate(largest_in_blocks(step, BLOCK_PX), np.ones((3, 3), np.uint8))
     fine = np.zeros(near.size, dtype=bool)
     fine[np.argsort(-near.ravel().astype(int), kind="stable")[: FINE_PX // BLOCK_PX**2]] = True
-    return fine.reshape(rows, columns)
+    return fine.reshape(near.shape)
 
 
 def find_quads(gray: Image, how: Binarisation = PLAIN) -> Array:
