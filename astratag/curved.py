@@ -54,7 +54,7 @@ PROMISING, MAX_CANDIDATES, MAX_READ, MAX_GLANCED_AT = 0.44, 4, 5, 200
 
 Of so many whose cells are glanced at, the likeliest: of 56 bent prints that were found, all were among the first 3.
 """
-SHARE_OF_LOOKS, AT_ONCE, WORTH_MOVING = 0.25, 0.66, 0.62
+SHARE_OF_LOOKS, AT_ONCE, WORTH_MOVING = 0.25, 0.69, 0.62
 """What the correlation of a bent square, and this share of how it looks, must come to for it to be moved at once, or at
 all.
 

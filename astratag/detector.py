@@ -6,7 +6,7 @@ promising ones.  What is found surely ends the search.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -86,6 +86,10 @@ LEAST_CLOSE_PX = 18.0
 
 Of 300 markers found by their edges or an alignment the smallest square was 19 pixels wide; what chance makes read like
 a code is mostly smaller.
+"""
+ANOTHER_LAYER, SAME_PLACE = 1.4, 0.6
+"""How many times larger a bent square is, at least, that may be another layer of the same marker; and how far apart
+their centres may look, in sides of the larger.
 """
 MAX_ALIGNED_AT_ONCE = 4
 """Candidates that are moved until they look as they read, of those found by one way of telling ink from paper."""
@@ -309,17 +313,22 @@ class Detector(Confirmer):
             if _inside_any(candidate.corners_px, found):
                 continue
             promise = promise_of(view.gray, candidate, self._codebook, self._artwork)
-            if promise is not None and promise >= 0:
-                take(candidate, self._move(view, candidate))
-            elif promise is not None:
-                view.later.append(replace(candidate, promise=promise))
+            if promise is None:
+                continue
+            candidate = replace(candidate, promise=promise)
+            if promise >= 0:
+                take(candidate, self._move(view, candidate, view.effort.begin))
+            else:
+                view.later.append(candidate)
+        for candidate in _best([one for one in view.later if not found and _seconded(view, one)]):
+            view.later.remove(candidate)
+            take(candidate, self._move(view, candidate, view.effort.begin))
         return found + [seen for seen in surest(unmeasured) if not _inside_any(seen.corners_px, found)]
 
-    def _move(self, view: View, candidate: Candidate) -> Detection | None:
+    def _move(self, view: View, candidate: Candidate, spend: Callable[[float], bool]) -> Detection | None:
         """Return the marker a candidate is once aligned, None when it is none, or enough were tried."""
         curved = isinstance(candidate.warp, CylinderWarp)
         tries, units = (view.curved, COST.curved) if curved else (view.aligned, COST.aligned)
-        spend = view.effort.begin if candidate.promise >= 0 else view.effort.spend
         if not (tries.take(candidate) and spend(units)):
             return None
         found = self._confirm_aligned(view, candidate)
@@ -329,10 +338,28 @@ class Detector(Confirmer):
 
     def search_later(self, view: View) -> list[Detection]:
         """Return the first marker among the candidates that were not promising enough at once, the best first."""
-        best = sorted(view.later, key=lambda candidate: -candidate.promise)
-        found = (self._move(view, candidate) for candidate in best)
+        found = (self._move(view, candidate, view.effort.spend) for candidate in _best(view.later))
         first = next((seen for seen in found if seen is not None), None)
         return [] if first is None else [first]
+
+
+def _best(candidates: Sequence[Candidate]) -> list[Candidate]:
+    return sorted(candidates, key=lambda candidate: -candidate.promise)
+
+
+def _seconded(view: View, candidate: Candidate) -> bool:
+    """Return whether another bent square, about the same place, reads the same: another layer, then.
+
+    Chance seldom reads one code twice.
+    """
+    return candidate.bent and any(_another_layer(candidate, one) for one in (*view.curved.made, *view.later))
+
+
+def _another_layer(candidate: Candidate, other: Candidate) -> bool:
+    small_px, large_px = sorted((candidate.side_px, other.side_px))
+    apart_px = np.linalg.norm(candidate.corners_px.mean(axis=0) - other.corners_px.mean(axis=0))
+    same = other.bent and candidate.reading.marker_id == other.reading.marker_id
+    return bool(same and large_px >= ANOTHER_LAYER * small_px and apart_px < SAME_PLACE * large_px)
 
 
 def _outlines(view: View, how: Binarisation) -> Outlines:
