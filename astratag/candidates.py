@@ -38,7 +38,7 @@ MAX_READ_FLAT = 12
 """Quads that are read, the likeliest by their cells' middles: of 230 that were markers all were among the first two."""
 LEAST_LIKENESS = 0.45
 """Correlation of a layer, as printed, with what is seen below which it is something else."""
-AT_ONCE, AT_ONCE_RELIT = 0.7, 0.56
+AT_ONCE, AT_ONCE_RELIT = 0.7, 0.55
 """Correlation from which a flat square is moved at once.  Of unevenly lit ones, of fewer cells, how much better than
 promising it must be, together with a share of how they look.
 

@@ -16,9 +16,9 @@ SAME_SQUARE = 0.04
 """Squares whose centres and sides differ by less than this fraction are one square found twice."""
 BETTER = 0.03
 """A square that was looked at is looked at again where it reads so much better."""
-LEAST_UNITS, UNITS_A_PIXEL, MOST_UNITS, SHARE_OF_FLAT = 7_000, 0.0291, 16_500, 0.69
+LEAST_UNITS, UNITS_A_PIXEL, MOST_UNITS, SHARE_OF_FLAT = 6_500, 0.02425, 15_000, 0.68
 """What one image is worth whatever its size, and more for each pixel, up to a limit: what the hardest markers of the
-benchmark take, which at 640x480 is 16 000; and the share of that where every marker is known to be flat.  A plain one
+benchmark take, which at 640x480 is 14 000; and the share of that where every marker is known to be flat.  A plain one
 with a marker takes about a thousand.
 
 A unit is what takes about a microsecond, counted and never measured, so that the same image always gets the same.
@@ -54,15 +54,15 @@ class Effort:
 class Costs:
     """What is done in an image, in units."""
 
-    look: float = 300.0
+    look: float = 250.0
     """One way of telling ink from paper, however small the picture."""
-    pixel: float = 0.0015
+    pixel: float = 0.0013
     """Of a picture in which outlines are looked for."""
     resized_pixel: float = 0.0002
     """More of the whole picture, at the resolution worked at."""
     border_pixel: float = 0.009
     """Of the borders of all shapes: followed, or looked through for near sides."""
-    outline: float = 4.5
+    outline: float = 6.5
     """Simplified, and read as if flat; or simplified as if bent."""
     edges: float = 150.0
     aligned: float = 900.0
@@ -73,7 +73,7 @@ class Costs:
     curved: float = 1350.0
     relit: float = 34.0
     """A square read cell by cell."""
-    by_pixels: float = 160.0
+    by_pixels: float = 270.0
     matched: float = 1500.0
     spline: float = 190.0
 
