@@ -28,7 +28,7 @@ from astratag.geometry import (
 )
 from astratag.grow import ALL_EDGES, Fit, layer_side_px, settle
 from astratag.neighbours import Crossings
-from astratag.polygons import simplified, turn
+from astratag.polygons import no_splits, simplified_into, turn
 from astratag.sampling import AS_GRAY, Light
 from astratag.search import Outlines
 from astratag.signature import (
@@ -137,14 +137,16 @@ def _near_sides(
     its perimeter (N,).
     """
     sides, lengths, found = np.empty((len(points), 2, 2)), np.empty(len(points)), 0
+    most = np.diff(starts).max() if len(starts) > 1 else 0
+    splits, off, room = no_splits(most, most)
     for i in range(len(starts) - 1):
         contour = points[starts[i] : starts[i + 1]]
         if perimeters[i] < 2 * least_near or max(np.ptp(contour[:, 0]), np.ptp(contour[:, 1])) < least_near:
             continue
-        polygon = simplified(contour, tolerance, len(contour))[::-1]
-        count = len(polygon)
+        count = simplified_into(contour, splits, off, room, tolerance)
         if count < 4:
             continue
+        polygon = room[:count][::-1]
         for k in range(count):
             first, second = polygon[k], polygon[(k + 1) % count]
             before, after = first - polygon[k - 1], polygon[(k + 2) % count] - second

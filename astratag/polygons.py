@@ -130,7 +130,7 @@ def _farthest_off(contour: Array, begin: int, end: int) -> tuple[float, int]:
 
 
 @compiled(INT, INT)
-def _no_splits(points: int, most: int) -> tuple[NDArray[np.int64], Array, Array]:
+def no_splits(points: int, most: int) -> tuple[NDArray[np.int64], Array, Array]:
     """Return room for how a contour of so many points is split, and for a polygon of ``most``; see ``_simplified``."""
     return np.empty((2 * points + 4, 6), dtype=np.int64), np.empty(2 * points + 4), np.empty((most + 1, 2))
 
@@ -146,7 +146,7 @@ def _begin_splits(start: int, other: int, splits: NDArray[np.int64], off: Array)
 
 @compiled(MATRIX, INTO_INDICES, INTO_VECTOR, INTO_MATRIX, REAL)
 def _simplified(contour: Array, splits: NDArray[np.int64], off: Array, polygon: Array, tolerance: float) -> int:
-    """Write what ``simplified`` returns of a contour (N, 2) into a polygon (M + 1, 2); return how many points it has.
+    """Do as ``simplified_into`` once the first splits are made.
 
     Where it is split does not depend on the tolerance: what was found out at one serves the next, and it is split
     further where that is needed.  Part k leads ``off`` (K,) k, times its length, off a straight line, at a point; it is
@@ -180,6 +180,20 @@ def _simplified(contour: Array, splits: NDArray[np.int64], off: Array, polygon: 
     return _cleaned(polygon, size, tolerance * tolerance)
 
 
+@compiled(MATRIX, INTO_INDICES, INTO_VECTOR, INTO_MATRIX, REAL)
+def simplified_into(contour: Array, splits: NDArray[np.int64], off: Array, polygon: Array, tolerance: float) -> int:
+    """Write what ``simplified`` returns into a polygon (M + 1, 2); return how many points it has.
+
+    Room is of ``no_splits``.
+    """
+    start, other, squared = _far_apart(contour)
+    if squared <= tolerance * tolerance:
+        polygon[0] = contour[start]
+        return 1
+    _begin_splits(start, other, splits, off)
+    return _simplified(contour, splits, off, polygon, tolerance)
+
+
 @compiled(MATRIX, REAL, INT)
 def simplified(contour: Array, tolerance: float, most: int) -> Array:
     """Return the polygon (M, 2) that a closed contour (N, 2) stays within a tolerance of.
@@ -189,12 +203,8 @@ def simplified(contour: Array, tolerance: float, most: int) -> Array:
     Ramer, "An iterative procedure for the polygonal approximation of plane curves", 1972; Douglas and Peucker, 1973.
     Begun, ordered and cleaned of points on nearly straight lines as OpenCV's ``approxPolyDP`` does.
     """
-    start, other, squared = _far_apart(contour)
-    if squared <= tolerance * tolerance:
-        return contour[start : start + 1].copy()
-    splits, off, polygon = _no_splits(len(contour), most)
-    _begin_splits(start, other, splits, off)
-    return polygon[: _simplified(contour, splits, off, polygon, tolerance)]
+    splits, off, polygon = no_splits(len(contour), most)
+    return polygon[: simplified_into(contour, splits, off, polygon, tolerance)]
 
 
 @compiled(MATRIX)
@@ -286,7 +296,7 @@ def convex_quads(
     """
     count = len(perimeters)
     found, quads, hulls = np.zeros(count, dtype=np.bool_), np.zeros((count, 4, 2)), 0
-    splits, off, polygon = _no_splits(np.diff(starts).max() if count > 0 else 0, MOST_POINTS)
+    splits, off, polygon = no_splits(np.diff(starts).max() if count > 0 else 0, MOST_POINTS)
     for i in range(count):
         contour = points[starts[i] : starts[i + 1]]
         found[i] = _convex_quad(contour, perimeters[i], tolerances, whole, splits, off, polygon, quads[i])
@@ -459,15 +469,18 @@ def bent_quads(
     """
     count = len(perimeters)
     found, corners, bulges = np.zeros(count, dtype=np.bool_), np.zeros((count, 4, 2)), np.zeros((count, 4, 2))
+    splits, off, room = no_splits(np.diff(starts).max() if count > 0 else 0, 2 * most_vertices)
     for i in range(count):
         contour = points[starts[i] : starts[i + 1]]
-        polygon = simplified(contour, tolerance * perimeters[i], 2 * most_vertices)[::-1].copy()
-        if not 4 <= len(polygon) <= most_vertices:
+        vertices = simplified_into(contour, splits, off, room, tolerance * perimeters[i])
+        if not 4 <= vertices <= most_vertices:
             continue
+        polygon = room[:vertices][::-1].copy()
         turns = _turns(polygon)
-        sharpest = np.sort(np.argsort(-turns, kind="mergesort")[:4])
-        four = polygon[sharpest]
-        if turns[sharpest].min() >= least_turn and _shortest(four) >= least_side:
+        if (turns >= least_turn).sum() < 4:
+            continue
+        four = polygon[np.sort(np.argsort(-turns, kind="mergesort")[:4])]
+        if _shortest(four) >= least_side:
             found[i] = True
             ordered, bulges[i] = _bulge(contour[::-1].copy(), four)
             corners[i] = grown(ordered, outset)
