@@ -231,7 +231,7 @@ class Detector(Confirmer):
         if not self._bends:
             return []
         found, outlines = self._search_bent(view, _outlines(view, THIN)), _outlines(view, NARROW)
-        if found or not view.effort.spend(COST.border_pixel * outlines.followed):
+        if found or not view.effort.spend(COST.near_pixel * outlines.followed):
             return found
         return self._search_curved(view, bent_beside(view.some_camera, near_sides(outlines)))
 

@@ -16,7 +16,7 @@ SAME_SQUARE = 0.04
 """Squares whose centres and sides differ by less than this fraction are one square found twice."""
 BETTER = 0.03
 """A square that was looked at is looked at again where it reads so much better."""
-LEAST_UNITS, UNITS_A_PIXEL, MOST_UNITS, SHARE_OF_FLAT = 6_500, 0.02425, 15_000, 0.68
+LEAST_UNITS, UNITS_A_PIXEL, MOST_UNITS, SHARE_OF_FLAT = 6_600, 0.02425, 15_000, 0.68
 """What one image is worth whatever its size, and more for each pixel, up to a limit: what the hardest markers of the
 benchmark take, which at 640x480 is 14 000; and the share of that where every marker is known to be flat.  A plain one
 with a marker takes about a thousand.
@@ -61,7 +61,9 @@ class Costs:
     resized_pixel: float = 0.0002
     """More of the whole picture, at the resolution worked at."""
     border_pixel: float = 0.009
-    """Of the borders of all shapes: followed, or looked through for near sides."""
+    """Of the borders of all shapes, which are followed."""
+    near_pixel: float = 0.02
+    """Of these, looked through for near sides."""
     outline: float = 6.5
     """Simplified, and read as if flat; or simplified as if bent."""
     edges: float = 150.0
@@ -75,7 +77,7 @@ class Costs:
     """A square read cell by cell."""
     by_pixels: float = 270.0
     matched: float = 1500.0
-    spline: float = 190.0
+    spline: float = 450.0
 
 
 COST = Costs()
