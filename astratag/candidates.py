@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from astratag.align import COARSE_BLUR, COARSE_STEPS, FINE_STEPS, align
 from astratag.compiled import CUBE, MATRIX, compiled
 from astratag.frame import FRAME, darker_inside
-from astratag.geometry import LAYERS, TEMPLATE_UNITS, square
+from astratag.geometry import LAYERS, TEMPLATE_UNITS, renamed, square
 from astratag.relight import RELIT_SAMPLES, relit_cells
 from astratag.search import BentQuads
 from astratag.signature import (
@@ -162,7 +162,7 @@ def points_in(quads: Array, template: Array) -> Array:
 
 def _turned(reading: Reading, quad: Array) -> Candidate:
     """Return a candidate with its corners turned from the order they were read in to the marker's own."""
-    corners_px = np.roll(quad, -reading.quarter_turns, axis=0)
+    corners_px = renamed(quad, reading.quarter_turns)
     return Candidate(reading, corners_px, HomographyWarp.from_points(OUTER, corners_px))
 
 
@@ -222,7 +222,7 @@ def _bent(gray: Image, corners_px: Array, bulges_px: Array, codebook: Codebook) 
     turns = readings[best].quarter_turns
     order = np.roll(np.arange(len(KNOTS)).reshape(-1, 4), -turns, axis=1).ravel()  # knots come in fours, like corners
     warp = BentWarp.from_points(KNOTS, places[best][order])
-    return Candidate(readings[best], np.roll(corners_px, -turns, axis=0), warp, bent=True)
+    return Candidate(readings[best], renamed(corners_px, turns), warp, bent=True)
 
 
 _SPLINE, _SPLINE_MIDDLES = (ThinPlate(KNOTS).basis(points) for points in (SAMPLES, CELL_MIDDLES))

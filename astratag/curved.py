@@ -25,6 +25,7 @@ from astratag.geometry import (
     LAYERS,
     cell_polygons,
     layer_points,
+    renamed,
 )
 from astratag.grow import ALL_EDGES, Fit, layer_side_px, settle
 from astratag.neighbours import Crossings
@@ -180,7 +181,7 @@ def curved_candidates(gray: Image, bent: Bent, codebook: Codebook, artwork: Artw
     found: list[Candidate] = []
     for i, reading in codebook.best_readings(cells, np.full(len(at), PROMISING), MAX_READ):
         turns = reading.quarter_turns
-        corners = np.roll(corners_px[i], -turns, axis=0)
+        corners = renamed(corners_px[i], turns)
         candidate = Candidate(reading, corners, bent.warp(*at[i].tolist()).turned(turns), bent=True)
         if candidate.side_px >= LEAST_SIDE_PX and not any(_alike(candidate, before) for before in found):
             found.append(candidate)

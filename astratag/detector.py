@@ -371,7 +371,7 @@ def _outlines(view: View, how: Binarisation) -> Outlines:
     if not view.effort.spend(COST.look + COST.pixel * looked_at + COST.resized_pixel * enlarged):
         return NONE
     if how.scale not in view.scaled:
-        view.scaled[how.scale] = scaled(view.gray, how.scale)
+        view.scaled[how.scale] = scaled(view.gray, how.scale, view.scaled.get(1.0))
     found = find_outlines(view.gray, how, view.scaled[how.scale])
     borders = COST.border_pixel * found.followed
     view.outlines[how] = found if view.effort.spend(borders + COST.outline * found.contours.count) else NONE

@@ -263,6 +263,17 @@ def print_from_template(points: NDArray[np.float64], side_m: float) -> NDArray[n
     return (np.asarray(points) - half) * (np.array([1.0, -1.0]) * (side_m / TEMPLATE_UNITS))
 
 
+_FROM_EACH = (np.arange(4) + np.arange(4)[:, None]) % 4
+
+
+def renamed(corners: NDArray[np.float64], quarter_turns: int) -> NDArray[np.float64]:
+    """Return corners (4, 2) in the order of a print whose first one is so many further on.
+
+    As ``numpy.roll`` does, which takes ten times as long.
+    """
+    return corners[_FROM_EACH[quarter_turns % 4]]
+
+
 def layer_corners_print(layer: int, side_m: float) -> NDArray[np.float64]:
     """Return the black square's corners (4, 2) of a layer on the flat print, metres, x right, y up."""
     return print_from_template(square(*LAYERS[layer].black), side_m)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from astratag.codes import acceptance_threshold
 from astratag.codes.acceptance import FALSE_ACCEPT_RATE
-from astratag.geometry import LAYERS, TEMPLATE_UNITS, square
+from astratag.geometry import LAYERS, TEMPLATE_UNITS, renamed, square
 from astratag.synthesis import Alignment, Synthesis
 from astratag.warp import HomographyWarp
 
@@ -92,7 +92,7 @@ def match(synthesis: Synthesis, light: Light, rough: Rough, blur_px: float, acce
     for _ in range(READINGS):
         row, turns = divmod(int(scores.argmax()), 4)
         marker_id = synthesis.ids[row]
-        warp = HomographyWarp.from_points(OUTER, np.roll(warp(OUTER), -turns, axis=0))
+        warp = HomographyWarp.from_points(OUTER, renamed(warp(OUTER), turns))
         aligned = synthesis.align(light, warp, marker_id, blur_px, hopeless=HOPELESS)
         if aligned is None or aligned.blur_px > MOST_BLUR * _side_px(aligned.warp):
             return None

@@ -186,10 +186,13 @@ class Scaled:
         return threshold_enlarged(smooth, sums, worth, near, block_px, window_px, how.offset, how.holes)
 
 
-def scaled(gray: Image, scale: float) -> Scaled:
-    """Return an image to be looked at in another resolution; of an enlarged one, only the best parts are worth it."""
+def scaled(gray: Image, scale: float, plain: Scaled | None = None) -> Scaled:
+    """Return an image to be looked at in another resolution; of an enlarged one, only the best parts are worth it.
+
+    ``plain`` is what this makes of it in its own resolution, if that is known: its sums serve an enlarged one too.
+    """
     if scale > 1:
-        return Scaled(gray, round(scale), _worth_a_fine_look(gray))
+        return Scaled(gray, round(scale), _worth_a_fine_look(gray), plain.kept if plain else {})
     return Scaled(gray if scale == 1 else cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
 
 

@@ -24,6 +24,7 @@ from astratag.geometry import (
     layer_points,
     midpoint_square,
     print_from_template,
+    renamed,
     square,
     turn_clockwise,
 )
@@ -187,3 +188,9 @@ def test_nothing_touches_in_any_geometry(geometry):
         assert inner.black[0] - near == pytest.approx(geometry.border * TEMPLATE_UNITS / 2 ** (inner.index - 1))
         assert not ((cells > near) & (cells < far)).all(axis=-1).any()
         np.testing.assert_allclose(layer_points(square(0, TEMPLATE_UNITS), inner), square(*inner.black))
+
+
+@pytest.mark.parametrize("quarter_turns", [-1, 0, 1, 2, 3, 5])
+def test_corners_are_renamed_as_if_rolled(quarter_turns):
+    corners = square(3.0, 5.0)
+    np.testing.assert_array_equal(renamed(corners, quarter_turns), np.roll(corners, -quarter_turns, axis=0))

@@ -17,7 +17,7 @@ from astratag.binarise import sums_of, threshold_blocks, threshold_enlarged, tra
 from astratag.candidates import Candidate
 from astratag.codes import Reading
 from astratag.describe import outer_corners
-from astratag.detector import MAX_MATCHED
+from astratag.detector import MAX_MATCHED, _seconded
 from astratag.effort import BETTER, COST, LEAST_UNITS, MOST_UNITS, UNITS_A_PIXEL, Effort, Tries, first_distinct
 from astratag.geometry import LAYERS, TEMPLATE_UNITS, square
 from astratag.polygons import hull, simplified
@@ -233,6 +233,26 @@ def test_a_square_is_tried_again_only_if_it_reads_better_and_never_more_than_so_
     assert tries.take(replace(first, reading=Reading(4, 0, 0.6, 2)))
     assert not tries.take(replace(first, corners_px=corners + 50.0))
     assert len(tries.made) == 3
+    tries.succeed()  # a marker does not count
+    assert tries.take(replace(first, corners_px=corners + 50.0))
+
+
+def test_a_bent_square_is_seconded_by_another_layer_that_reads_the_same():
+    """About the same place, of another size, and bent; not by itself, nor by what reads otherwise or lies elsewhere."""
+    corners = turned_square(0)
+    warp = HomographyWarp.from_points(square(0.0, TEMPLATE_UNITS), corners)
+    inner = Candidate(Reading(3, 0, 0.5, 9), corners, warp, bent=True)
+    outer = replace(inner, corners_px=corners.mean(axis=0) + 2.3 * (corners - corners.mean(axis=0)))
+    view = Detector().view(np.zeros((HEIGHT, WIDTH), np.uint8), None)
+    view.later.append(inner)
+    assert not _seconded(view, inner)
+    assert _seconded(view, outer)
+    assert not _seconded(view, replace(outer, reading=Reading(4, 0, 0.5, 9)))
+    assert not _seconded(view, replace(outer, corners_px=outer.corners_px + 200.0))
+    assert not _seconded(view, replace(outer, bent=False))
+    view.later.clear()
+    view.curved.take(outer)  # and came to nothing
+    assert _seconded(view, inner)
 
 
 def adversarial(kind: str) -> np.ndarray:
