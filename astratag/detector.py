@@ -320,7 +320,9 @@ class Detector(Confirmer):
                 take(candidate, self._move(view, candidate, view.effort.begin))
             else:
                 view.later.append(candidate)
-        for candidate in _best([one for one in view.later if not found and _seconded(view, one)]):
+        for candidate in _best([one for one in view.later if _seconded(view, one)]):
+            if found:
+                break
             view.later.remove(candidate)
             take(candidate, self._move(view, candidate, view.effort.begin))
         return found + [seen for seen in surest(unmeasured) if not _inside_any(seen.corners_px, found)]
