@@ -42,8 +42,8 @@ AT_ONCE, AT_ONCE_RELIT = 0.7, 0.55
 """Correlation from which a flat square is moved at once.  Of unevenly lit ones, of fewer cells, how much better than
 promising it must be, together with a share of how they look.
 
-Of 393 that were markers once moved 82 in a hundred have more, of others that read like one 11; of 143 unevenly lit ones
-95, of others 66.
+Of 393 that were markers once moved 82 in a hundred have more, of others that read like one 11; of 118 unevenly lit ones
+all, of others 91.
 """
 SHARE_OF_LOOKS, WORTH_MOVING = 0.75, 0.54
 """What this share of how a flat square looks, and how much better than promising it reads, must come to.
