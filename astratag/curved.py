@@ -29,7 +29,7 @@ from astratag.geometry import (
 )
 from astratag.grow import ALL_EDGES, Fit, layer_side_px, settle
 from astratag.neighbours import Crossings
-from astratag.polygons import no_splits, simplified_into, turn
+from astratag.polygons import turn
 from astratag.sampling import AS_GRAY, Light
 from astratag.search import Outlines
 from astratag.signature import (
@@ -42,6 +42,7 @@ from astratag.signature import (
     sample,
     unit,
 )
+from astratag.simplify import no_splits, simplified_into
 from astratag.warp import FittedWarp
 
 Array = NDArray[np.float64]

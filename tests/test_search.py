@@ -20,7 +20,6 @@ from astratag.describe import outer_corners
 from astratag.detector import MAX_MATCHED, _seconded
 from astratag.effort import BETTER, COST, LEAST_UNITS, MOST_UNITS, UNITS_A_PIXEL, Effort, Tries, first_distinct
 from astratag.geometry import LAYERS, TEMPLATE_UNITS, square
-from astratag.polygons import hull, simplified
 from astratag.search import (
     BLOCK_PX,
     BROAD,
@@ -40,6 +39,7 @@ from astratag.search import (
     quads_of,
     scaled,
 )
+from astratag.simplify import hull, simplified
 from astratag.transforms import exp_so3, pose
 from astratag.view import MAX_ALIGNED, MAX_BY_EDGES, MAX_CURVED
 from astratag.warp import HomographyWarp, PoseWarp
