@@ -135,7 +135,7 @@ def _solution(columns: Array, value: Array, weight: Array, step_sigma: Array, si
 
 @compiled(MATRIX, VECTOR, FLAGS, VECTOR)
 def _solve(columns: Array, value: Array, inside: NDArray[np.bool_], step_sigma: Array) -> Array:
-    """Return the step (P,) that is the first unknowns of columns (P + 9, N), twice weighted against outliers.
+    """Return the step (P,) that is the first unknowns of columns (P + 9, N), solved again weighted against outliers.
 
     Only values (N,) ``inside`` the image count.
     """
