@@ -70,11 +70,19 @@ FEW_INTERVALS = 4
 _OUTWARDS = np.array([(0.0, -1.0), (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0)])[[e.side for e in EDGES]][:, None, :]
 INK_TO_PAPER = _OUTWARDS[:, 0] * _TO_PAPER[:, None]
 """Unit vectors (20, 2) across the edges, template axes."""
+EDGE_DIRECTION = np.stack([-_OUTWARDS[:, 0, 1], _OUTWARDS[:, 0, 0]], axis=1)
+"""Unit vectors (20, 2) along the edges, as their points follow one another."""
+EDGE_SPACING = np.linalg.norm(EDGE_POINTS[:, 1] - EDGE_POINTS[:, 0], axis=1)
+"""Template units (20,) between neighbouring points."""
 _FEW_POINTS = EDGE_POINTS[:, :: (POINTS_PER_EDGE - 1) // FEW_INTERVALS]
 ALONG_SHARE = (POINTS_PER_EDGE - 1) / POINTS_PER_EDGE / (1 - 2 * END_MARGIN)
 """The length of an edge over the sum of its points' spacings."""
-_PROBES = np.concatenate([EDGE_POINTS, _FEW_POINTS - _OUTWARDS, _FEW_POINTS + MARGIN_UNITS * _OUTWARDS], axis=1)
-"""The points of each edge, a few of them one unit further in, and as far out as the quiet margin is wide."""
+_OUTERMOST = (EDGE_LAYER == 0) & ~EDGE_IS_FRAME
+EDGE_OUTSIDE = np.where(_OUTERMOST, MARGIN_UNITS, EDGE_REACH)
+"""How far outside of each edge to look how large units are there: to the quiet margin's end, or the next edge."""
+_OUTSIDE = EDGE_OUTSIDE[:, None, None] * _OUTWARDS
+_PROBES = np.concatenate([EDGE_POINTS, _FEW_POINTS - _OUTWARDS, _FEW_POINTS + _OUTSIDE], axis=1)
+"""The points of each edge, a few of them one unit further in, and ``EDGE_OUTSIDE`` further out."""
 
 
 def inverse_transfer(transfer: Transfer) -> NDArray[np.float32]:
@@ -96,8 +104,9 @@ def inverse_transfer(transfer: Transfer) -> NDArray[np.float32]:
 class Template(NamedTuple):
     """What E edges are in the template, not to be changed: warps keep where these points are on a surface.
 
-    ``points`` (E M, 2); ``probes`` (E, M + 10, 2) the points, a few of them one unit further in, and as far out as the
-    quiet margin; ``few`` (E 5, 2); ``to_paper`` (E,) +1 where paper is outwards, else -1; ``reach`` (E,).
+    ``points`` (E M, 2); ``probes`` (E, M + 10, 2) the points, a few of them one unit further in, and ``outside`` (E,)
+    further out; ``few`` (E 5, 2); ``to_paper`` (E,) +1 where paper is outwards, else -1; ``reach`` (E,); ``spacing``
+    (E,) of the points.
     """
 
     points: Array
@@ -105,6 +114,8 @@ class Template(NamedTuple):
     few: Array
     to_paper: Array
     reach: Array
+    spacing: Array
+    outside: Array
 
 
 def template_of(edges: NDArray[np.int64]) -> Template:
@@ -116,7 +127,7 @@ def template_of(edges: NDArray[np.int64]) -> Template:
 def _template_of(edges: tuple[int, ...]) -> Template:
     chosen = list(edges)
     flat = (EDGE_POINTS[chosen].reshape(-1, 2), _PROBES[chosen], _FEW_POINTS[chosen].reshape(-1, 2))
-    template = Template(*flat, _TO_PAPER[chosen], EDGE_REACH[chosen])
+    template = Template(*flat, _TO_PAPER[chosen], EDGE_REACH[chosen], EDGE_SPACING[chosen], EDGE_OUTSIDE[chosen])
     for part in template:
         part.flags.writeable = False
     return template

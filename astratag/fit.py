@@ -13,12 +13,14 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from astratag.backdrop import backdrop
+from astratag.bells import around
 from astratag.compiled import CUBE, FLAG_MATRIX, FLAGS, GRAY, INDICES, INT, MATRIX, REAL, VECTOR, compiled
 from astratag.edges import POINTS_PER_EDGE, template_of
 from astratag.locate import locate
 from astratag.neighbours import UNKNOWN, Crossings
 from astratag.normal import dot, factored, inverse, ranked
-from astratag.pulls import SHARP_REACH_PX, pulls_on
+from astratag.pulls import SHARP_REACH_PX, pulls_on, within_reach
 from astratag.sampling import Light
 from astratag.warp import FittedWarp
 
@@ -88,7 +90,7 @@ def fit_edges(
     """
     template, before = template_of(edges), warp
     probes_px, facing = warp(template.probes), warp.visible(template.few)
-    found = _measured(*light, probes_px, facing, edges, template.to_paper, template.reach, *near, search_px)
+    found = _measured(*light, probes_px, facing, edges, *template[3:], *near, search_px)
     used, points, places_px, normal, reach_px, sharp = found
     if len(used) == 0:
         return None
@@ -128,7 +130,7 @@ def _on_all_sides(edges: NDArray[np.int64], use: Mask) -> bool:
     return bool(followed.all())
 
 
-@compiled(GRAY, VECTOR, CUBE, FLAGS, INDICES, VECTOR, VECTOR, CUBE, CUBE, CUBE, REAL)
+@compiled(GRAY, VECTOR, CUBE, FLAGS, INDICES, VECTOR, VECTOR, VECTOR, VECTOR, CUBE, CUBE, CUBE, REAL)
 def _measured(
     gray: NDArray[np.uint8],
     of_gray: Array,
@@ -137,9 +139,11 @@ def _measured(
     edges: NDArray[np.int64],
     to_paper: Array,
     reach: Array,
+    spacing: Array,
+    outside: Array,
     distance: Array,
     jump: Array,
-    cosine: Array,
+    skew: Array,
     search_px: float,
 ) -> tuple[NDArray[np.int64], Array, Array, Array, Array, int]:
     """Return which N of all points of E edges are measured, none when that is too few, and what is known of them.
@@ -148,19 +152,31 @@ def _measured(
     on an edge that looks short, variances and growths of pulls (5, N).  Then of all points where they were measured
     and the normals there (2, E M); of edges the reach (E,); and how many points on sharp ones are in view.
     """
-    seen = locate(gray, of_gray, probes_px, facing, to_paper, reach, search_px)
+    seen = locate(gray, of_gray, probes_px, facing, to_paper, reach, spacing, outside, search_px)
     use = _usable(seen.found, seen.in_view, seen.reach_px)
     if not _on_all_sides(edges, use):
         use[:] = False
-    known = pulls_on(
+    beside = around(
         distance,
         jump,
-        cosine,
+        skew,
         edges,
         seen.unit_px,
+        seen.growth_px,
+        seen.lean,
+        seen.squeeze,
+        seen.margin_px,
+        backdrop(gray, of_gray, edges, seen.predicted_px, seen.normal, seen.margin_px, seen.blur_px),
+        within_reach(seen.reach_px, seen.blur_px, use | seen.alone),
+    )
+    known = pulls_on(
+        beside,
+        edges,
+        seen.length_px,
         seen.reach_px,
         seen.margin_px,
         seen.clipped_px,
+        seen.offset_px,
         seen.alone,
         use,
         seen.blur_px,
@@ -253,7 +269,7 @@ def _robust_least_squares(
                 residual[i] -= x[p] * A[p, i]
         before_px, sigma_px = sigma_px, max(_spread(residual, quiet), NOISE_FLOOR_PX)
         for i in range(points):
-            u2[i] = min(residual[i] ** 2 / (TUKEY**2 * (sigma_px**2 + common[i] / POINTS_PER_EDGE)), 1.0)
+            u2[i] = min(residual[i] ** 2 / (TUKEY**2 * (sigma_px**2 + common[i])), 1.0)
         if reweighted and abs(sigma_px - before_px) <= SAME_SPREAD * before_px:
             break
         for i in range(points):

@@ -52,9 +52,11 @@ class Edges(NamedTuple):
     """How E edges of M points each lie in the image where they are predicted, x and y first, and where they were found.
 
     ``predicted_px`` (2, E, M) are points on them and ``normal`` (2, E, M) the image unit vectors from ink to paper;
-    ``length_px`` (E,) is how long an edge looks, ``unit_px`` (E, M) how large a template unit looks across it and
-    ``reach_px`` (E,) how far it is from its neighbours.  For the outermost edges ``margin_px`` (E, M) is how wide
-    the quiet margin looks.
+    ``length_px`` (E,) is how long an edge looks, ``unit_px`` (E, M) how large a template unit looks across it,
+    ``growth_px`` (E, M) how much larger for each unit towards the paper, ``squeeze`` (E, M) over how large along it,
+    and ``reach_px`` (E,) how far it is from its neighbours.  Normals ``lean`` (E, M) in the print: by so many units
+    along the edge for each towards the paper.  For the outermost edges ``margin_px`` (E, M) is how wide the quiet
+    margin looks.
 
     ``offset_px`` (E, M) is the distance from there along the normals; only where ``found``, which is only where
     ``in_view``.  The points ``alone`` (E, M) are those furthest from their neighbours; ``blur_px`` is the standard
@@ -66,6 +68,9 @@ class Edges(NamedTuple):
     normal: Array
     length_px: Array
     unit_px: Array
+    growth_px: Array
+    lean: Array
+    squeeze: Array
     reach_px: Array
     margin_px: Array
     offset_px: Array
@@ -76,38 +81,50 @@ class Edges(NamedTuple):
     clipped_px: Array
 
 
-@compiled(CUBE, VECTOR, VECTOR)
-def _lie(seen_px: Array, to_paper: Array, reach: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
+@compiled(CUBE, VECTOR, VECTOR, VECTOR, VECTOR)
+def _lie(
+    seen_px: Array, to_paper: Array, reach: Array, spacing: Array, outside: Array
+) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array]:
     """Return how E edges lie in the image, the first of ``Edges``, from where their probes are seen (E, M + 10, 2)."""
     edges, points = len(seen_px), POINTS_PER_EDGE
-    few = (points - 1) // FEW_INTERVALS
+    few, along_px = (points - 1) // FEW_INTERVALS, np.empty(points)
     predicted, normal = np.empty((2, edges, points)), np.empty((2, edges, points))
     length, reach_px = np.zeros(edges), np.empty(edges)
     unit_px, margin_px = np.empty((edges, points)), np.empty((edges, points))
+    lean, squeeze = np.empty((edges, points)), np.empty((edges, points))
     across, outwards = np.empty(FEW_INTERVALS + 1), np.empty(FEW_INTERVALS + 1)
+    growth_px, growths = np.empty((edges, points)), np.empty(FEW_INTERVALS + 1)
+    leans, squeezes = np.empty(FEW_INTERVALS + 1), np.empty(FEW_INTERVALS + 1)
     for e in range(edges):
         for m in range(points):
             before, after = max(m - 1, 0), min(m + 1, points - 1)
             dx = (seen_px[e, after, 0] - seen_px[e, before, 0]) / (after - before)
             dy = (seen_px[e, after, 1] - seen_px[e, before, 1]) / (after - before)
-            spacing = np.sqrt(dx * dx + dy * dy) + 1e-9
-            length[e] += spacing * ALONG_SHARE
+            step_px = np.sqrt(dx * dx + dy * dy) + 1e-9
+            length[e] += step_px * ALONG_SHARE
+            along_px[m] = step_px / spacing[e]
             predicted[0, e, m], predicted[1, e, m] = seen_px[e, m]
-            normal[0, e, m], normal[1, e, m] = dy * to_paper[e] / spacing, -dx * to_paper[e] / spacing
+            normal[0, e, m], normal[1, e, m] = dy * to_paper[e] / step_px, -dx * to_paper[e] / step_px
         for k in range(FEW_INTERVALS + 1):
             x, y = seen_px[e, k * few]
             nx, ny = normal[0, e, k * few], normal[1, e, k * few]
             inner, outer = seen_px[e, points + k], seen_px[e, points + FEW_INTERVALS + 1 + k]
             across[k] = abs((inner[0] - x) * nx + (inner[1] - y) * ny)
+            leans[k] = ((inner[1] - y) * nx - (inner[0] - x) * ny) / along_px[k * few]
+            squeezes[k] = across[k] / along_px[k * few]
             outwards[k] = (outer[0] - x) * nx + (outer[1] - y) * ny
+            growths[k] = (outwards[k] / outside[e] - to_paper[e] * across[k]) / outside[e]
         # how far apart neighbouring edges look, where that is least: small when the print is seen at a slant
         reach_px[e] = reach[e] * across.min()
         for m in range(points):
             k = min(m // few, FEW_INTERVALS - 1)
             share = m / few - k
             unit_px[e, m] = across[k] + share * (across[k + 1] - across[k])
+            growth_px[e, m] = growths[k] + share * (growths[k + 1] - growths[k])
+            lean[e, m] = leans[k] + share * (leans[k + 1] - leans[k])
+            squeeze[e, m] = squeezes[k] + share * (squeezes[k + 1] - squeezes[k])
             margin_px[e, m] = outwards[k] + share * (outwards[k + 1] - outwards[k])
-    return predicted, normal, length, unit_px, reach_px, margin_px
+    return predicted, normal, length, unit_px, growth_px, lean, squeeze, reach_px, margin_px
 
 
 @compiled(CUBE, FLAGS, REAL, INT, INT)
@@ -301,7 +318,7 @@ def _seen(
     return offset_px, found, in_view, alone, blur_px, clipped_px
 
 
-@compiled(GRAY, VECTOR, CUBE, FLAGS, VECTOR, VECTOR, REAL)
+@compiled(GRAY, VECTOR, CUBE, FLAGS, VECTOR, VECTOR, VECTOR, VECTOR, REAL)
 def locate(
     gray: NDArray[np.uint8],
     of_gray: Array,
@@ -309,23 +326,23 @@ def locate(
     facing: Mask,
     to_paper: Array,
     reach: Array,
+    spacing: Array,
+    outside: Array,
     search_px: float,
 ) -> Edges:
     """Look for E edges up to ``search_px`` from where their probes are predicted (E, M + 10, 2).
 
-    See ``sampling.Light`` for the image, and ``edges.Template`` for ``to_paper`` (E,) and ``reach`` (E,); ``facing``
-    (5 E,) is which of a few points of each face the viewer.  An edge is never looked for beyond its own reach, so that
-    neighbours are not taken for it.  Blurred ones are looked for once more through a wider filter, as far as neighbours
-    leave room for it.
+    See ``sampling.Light`` for the image, and ``edges.Template`` for ``to_paper``, ``reach``, ``spacing`` and
+    ``outside`` (E,); ``facing`` (5 E,) is which of a few points of each face the viewer.  An edge is never looked for
+    beyond its own reach, so that neighbours are not taken for it.  Blurred ones are looked for once more through a
+    wider filter, as far as neighbours leave room for it.
     """
-    predicted, normal, length, unit_px, reach_px, margin_px = _lie(seen_px, to_paper, reach)
+    lie = _lie(seen_px, to_paper, reach, spacing, outside)
+    predicted, normal, reach_px = lie[0], lie[1], lie[7]
     seen = _seen(gray, of_gray, predicted, normal, reach_px, facing, search_px, SMOOTHING_PX)
     lens_px = np.sqrt(seen[4] ** 2 - SMOOTHING_PX**2)
     wider_px = min(SMOOTHING_OF_LENS * lens_px, reach_px.max() / REACH_OF_SMOOTHING)
     if wider_px >= WORTHWHILE * SMOOTHING_PX:
         wider_px = round(wider_px / SMOOTHING_STEP_PX) * SMOOTHING_STEP_PX
         seen = _seen(gray, of_gray, predicted, normal, reach_px, facing, search_px, wider_px)
-    offset_px, found, in_view, alone, blur_px, clipped_px = seen
-    return Edges(
-        predicted, normal, length, unit_px, reach_px, margin_px, offset_px, found, in_view, alone, blur_px, clipped_px
-    )
+    return Edges(*lie, *seen)

@@ -7,9 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from astratag.backdrop import FAR_MARGIN, OUTERMOST, THIN_MARGIN
+from astratag.bells import narrowing, pull
 from astratag.compiled import CUBE, FLAG_MATRIX, INDICES, MATRIX, REAL, VECTOR, compiled
 from astratag.edges import POINTS_PER_EDGE
-from astratag.neighbours import narrowing, pull
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -18,13 +19,12 @@ SHARP_REACH_PX = 4.0
 """An edge this far from its neighbours is sharp; nearer, they pull."""
 PULL_PX, PULL_FLOOR_PX = 0.023, 0.002
 """How far a whole edge may be off when its neighbours are as near as ``SHARP_REACH_PX``, and at least."""
-OUTERMOST = 4
-"""The first so many edges are those of the outermost square."""
-PULL_REST, PULL_GROWTH = 0.05, 2.0
-"""How wrong a single pull is besides; how much faster than a weak pull a strong one grows with blur."""
-BACKGROUND = 0.5
-"""How much darker or brighter than paper what is behind the print may be, over what ink is."""
-FAR_MARGIN, FAR_REACH = 5.0, 4.0
+PULL_REST, SHORT_PX2, PULL_GROWTH = 0.06, 0.2, 2.0
+"""How wrong a pull is that is known, as a fraction of it; how far a whole edge is off besides, times the length it is
+seen at, for what is beside it is not much longer; how much faster than a weak pull a strong one grows with blur."""
+BACKGROUND = 0.12
+"""How far off the brightness of what is behind the print may be, over how much darker than paper ink is."""
+FAR_REACH = 4.0
 """What is behind the print, and neighbours, do not pull from this many times the blur away."""
 MOST_BLUR_STEPS, SAME_BLUR = 3, 0.03
 """Blur and pull are found from each other until the blur changes by no more than this fraction."""
@@ -60,20 +60,11 @@ def _unknown(reach_px: Array, clipped_px: Array) -> Pulls:
     return Pulls(none, variance, np.ones(clipped_px.shape), none, np.zeros(clipped_px.shape, np.bool_))
 
 
-@compiled(CUBE, CUBE, CUBE, INDICES, MATRIX, VECTOR, FLAG_MATRIX, REAL)
-def _blur_alone(
-    distance: Array,
-    jump: Array,
-    cosine: Array,
-    edges: NDArray[np.int64],
-    unit_px: Array,
-    reach_px: Array,
-    alone: Mask,
-    seen_px: float,
-) -> float:
+@compiled(CUBE, VECTOR, FLAG_MATRIX, REAL)
+def _blur_alone(beside: Array, reach_px: Array, alone: Mask, seen_px: float) -> float:
     """Return the blur that edges would show without neighbours, which narrow or widen them to what is ``seen_px``."""
     nearest_px, points = np.inf, 0
-    for e in range(len(edges)):
+    for e in range(len(reach_px)):
         if alone[e].any():
             nearest_px = min(nearest_px, reach_px[e])
             points += int(np.count_nonzero(alone[e]))
@@ -81,8 +72,8 @@ def _blur_alone(
     if points == 0 or nearest_px > FAR_REACH * seen_px:
         return blur_px
     for _ in range(MOST_BLUR_STEPS):
-        narrowed, rounder = 0.0, narrowing(distance, jump, cosine, edges, unit_px, blur_px, alone)
-        for e in range(len(edges)):
+        narrowed, rounder = 0.0, narrowing(beside, blur_px, alone)
+        for e in range(len(reach_px)):
             for m in range(alone.shape[1]):
                 if alone[e, m]:
                     narrowed += rounder[e, m]
@@ -92,9 +83,15 @@ def _blur_alone(
     return blur_px
 
 
-@compiled(MATRIX, MATRIX, REAL, INDICES, MATRIX, MATRIX)
+@compiled(MATRIX, MATRIX, REAL, INDICES, VECTOR, MATRIX, MATRIX)
 def _known(
-    pull_px: Array, keen: Array, blur_px: float, edges: NDArray[np.int64], margin_px: Array, clipped_px: Array
+    pull_px: Array,
+    keen: Array,
+    blur_px: float,
+    edges: NDArray[np.int64],
+    length_px: Array,
+    margin_px: Array,
+    clipped_px: Array,
 ) -> Pulls:
     """Return what pulls (E, M), NaN where there is no knowing, tell."""
     believed, variance, growth = np.zeros(pull_px.shape), np.empty(pull_px.shape), np.zeros(pull_px.shape)
@@ -105,10 +102,10 @@ def _known(
             if size_px <= MOST_PULL * blur_px:
                 believed[e, m] = pull_px[e, m]
                 growth[e, m] = pull_px[e, m] * (1 + PULL_GROWTH / blur_px * size_px)
-                wrong_px2 = (PULL_REST * size_px) ** 2 + PULL_FLOOR_PX**2
+                wrong_px2 = (PULL_REST * size_px) ** 2 + (PULL_FLOOR_PX + SHORT_PX2 / max(length_px[e], 1.0)) ** 2
                 margin = margin_px[e, m] / blur_px
                 if edges[e] < OUTERMOST and margin < FAR_MARGIN:
-                    margin = max(margin, 1.0)
+                    margin = max(margin, THIN_MARGIN)
                     wrong_px2 += (BACKGROUND * blur_px * margin * np.exp(-0.5 * margin * margin)) ** 2
             else:
                 lost[e, m], wrong_px2 = True, LOST_PX**2
@@ -116,30 +113,36 @@ def _known(
     return Pulls(believed, variance, keen.copy(), growth, lost)
 
 
-@compiled(CUBE, CUBE, CUBE, INDICES, MATRIX, VECTOR, MATRIX, MATRIX, FLAG_MATRIX, FLAG_MATRIX, REAL)
+@compiled(VECTOR, REAL, FLAG_MATRIX)
+def within_reach(reach_px: Array, blur_px: float, points: Mask) -> Mask:
+    """Return which of the points (E, M) are on edges whose neighbours (E,) are near enough to pull."""
+    pulled = np.zeros(points.shape, np.bool_)
+    for e in range(len(reach_px)):
+        if reach_px[e] < FAR_REACH * blur_px:
+            pulled[e] = points[e]
+    return pulled
+
+
+@compiled(CUBE, INDICES, VECTOR, VECTOR, MATRIX, MATRIX, MATRIX, FLAG_MATRIX, FLAG_MATRIX, REAL)
 def pulls_on(
-    distance: Array,
-    jump: Array,
-    cosine: Array,
+    beside: Array,
     edges: NDArray[np.int64],
-    unit_px: Array,
+    length_px: Array,
     reach_px: Array,
     margin_px: Array,
     clipped_px: Array,
+    offset_px: Array,
     alone: Mask,
     use: Mask,
     blur_px: float,
 ) -> Pulls:
     """Return what is known of the pulls on points to ``use`` (E, M) of E ``edges``.
 
-    What lies beside edges are the fields of ``neighbours.Crossings``, how they lie and look those of ``locate.Edges``.
+    What is ``beside`` them is what ``bells.around`` returns, empty where the code is not known; how they lie and look
+    are fields of ``locate.Edges``.
     """
-    if len(distance) == 0:
+    if len(beside) == 0:
         return _unknown(reach_px, clipped_px)
-    blur_px = _blur_alone(distance, jump, cosine, edges, unit_px, reach_px, alone, blur_px)
-    pulled = np.zeros(use.shape, np.bool_)
-    for e in range(len(edges)):
-        if reach_px[e] < FAR_REACH * blur_px:
-            pulled[e] = use[e]
-    found = pull(distance, jump, cosine, edges, unit_px, blur_px, pulled)
-    return _known(found.px, found.curvature, blur_px, edges, margin_px, clipped_px)
+    blur_px = _blur_alone(beside, reach_px, alone, blur_px)
+    found = pull(beside, blur_px, within_reach(reach_px, blur_px, use), offset_px)
+    return _known(found.px, found.curvature, blur_px, edges, length_px, margin_px, clipped_px)

@@ -25,8 +25,9 @@ STEP_PX = 1.0
 """How far one step may take a point of the print, as a standard deviation."""
 LEAST_REACH_PX = 1e-12
 """By how much a parameter moves the print at least."""
-INTERPOLATED = 9 / 4
-"""Variance of a pixel's noise over that of values interpolated between pixels."""
+INTERPOLATED = 1.1
+"""Variance of a pixel's noise over that of residuals: 9/4 for values interpolated between pixels, less for what is left
+because looks are not exact; in between, measured on small markers."""
 LEAST_NOISE = 0.3
 """No light is believed to be known better than this, of 255."""
 OF_LIGHT, OF_LEVEL = 7, 4

@@ -64,13 +64,13 @@ REACH, LAYER_REACH = 0.07, 0.13
 SPACING_PX = 0.8
 MOST_LINES, MOST_AT_A_GLANCE, FEWEST_LINES = 32, 20, 12
 """Grid lines across the print: so many that they are ``SPACING_PX`` apart where it looks widest, within bounds."""
-SIGMA_FLOOR_PX = 0.012
+SIGMA_FLOOR_PX = 0.006
 """What a point's standard deviation never falls below: print, lens model, shape of the blur."""
 FINELY_SAMPLED_PX, COARSENESS = 64.0, 1.5
 """Prints that look larger are sampled so coarsely that this grows, by this power of their size."""
-MUCH_SLANTED = 2.0
-"""Prints seen at more than 60 degrees are off by more than the floor: measured, by the root of how much smaller they
-look one way.  A blur is not as round there as it is taken for."""
+SLANTING = 2 / 3
+"""Prints seen at a slant are off by more than the floor: measured, by this power of how much smaller they look one way.
+A blur is not as round there as it is taken for."""
 LEAST_BLUR_PX, MOST_BLUR_PX = 0.5, 8.0
 HALF_UNIT = 0.5
 """How far derivatives by place reach, template units."""
@@ -126,12 +126,13 @@ _OUTER.flags.writeable = False  # so that warps may keep where it is on a surfac
 def _nodes(count: int) -> Array:
     """Return points (K, 2) that stand for a standard normal distribution in the plane, alike in weight.
 
-    Vogel's spiral, with zero mean and unit covariance.
+    Half of a Vogel spiral and its mirror image about the middle, with unit covariance: what is seen through them is
+    not moved, as it would be by points that lie more to one side.
     """
-    i = np.arange(count) + 0.5
-    radius, angle = np.sqrt(-2 * np.log(1 - i / count)), i * np.pi * (3 - np.sqrt(5.0))
-    nodes = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    nodes -= nodes.mean(axis=0)
+    i = np.arange(count // 2) + 0.5
+    radius, angle = np.sqrt(-2 * np.log(1 - i / len(i))), i * np.pi * (np.sqrt(5.0) - 1) / 2
+    half = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    nodes = np.concatenate([half, -half])
     return np.ascontiguousarray(np.linalg.solve(np.linalg.cholesky(nodes.T @ nodes / count), nodes.T).T)
 
 
@@ -325,9 +326,9 @@ class Alignment(Generic[W]):
         return float(np.einsum("nip,pq,niq->", J, self.covariance, J)) / len(self.covariance)
 
     def _floor_px(self) -> float:
-        """Return ``SIGMA_FLOOR_PX``, more where a print looks so large that its grid is coarse, or is much slanted."""
+        """Return ``SIGMA_FLOOR_PX``, more where a print looks so large that its grid is coarse, or is slanted."""
         coarse = max(1.0, _widest_px(self.warp) / FINELY_SAMPLED_PX) ** COARSENESS
-        return SIGMA_FLOOR_PX * coarse * math.sqrt(max(1.0, self.slant / MUCH_SLANTED))
+        return SIGMA_FLOOR_PX * coarse * self.slant**SLANTING
 
 
 @compiled(GRAY, MATRIX, CUBE, VECTOR, VECTOR, MATRIX)

@@ -7,11 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from astratag import Detection, PlanarPose
 from astratag.signature import BLUR_UNITS, BLURRED_CELLS, EFFECTIVE_SHARE
+from astratag.transforms import exp_so3, pose
 from benchmarks.detection import clutter
 from benchmarks.detection.cost import SCENES, measure_cost
+from benchmarks.detection.covariance import Consistency, band, measure_covariance
 from benchmarks.detection.false_accepts import measure_effective_cells, measure_false_accepts
-from benchmarks.detection.figures import draw_condition, draw_cost
+from benchmarks.detection.figures import draw_condition, draw_cost, draw_covariance
 from benchmarks.detection.peers import ENTRANTS, MARKERS, TRACKED, Entrant, texture
 from benchmarks.detection.profile import measure_profile
 from benchmarks.detection.recall import SIZES, measure, wilson
@@ -52,6 +55,26 @@ def test_a_cell_of_each_condition(condition, tmp_path):
         assert row["images"] == 2
         assert row["recall_95"][0] <= row["recall"] <= row["recall_95"][1]
     assert draw_condition(condition, rows, tmp_path).stat().st_size > 0
+
+
+def test_covariances_of_a_cell_are_looked_at_beside_their_band(tmp_path):
+    rows = measure_covariance("tilt", 30, 2)
+    assert [row["surface"] for row in rows] == ["told", "unknown"]
+    for row in rows:
+        assert row["poses"] == 2 and row["other_pose"] == 0
+        assert row["nees_95"] == pytest.approx(band(2))
+        assert 0 < row["nees"] < 5
+    assert draw_covariance(rows, tmp_path).stat().st_size > 0
+
+
+def test_a_pose_whose_mirror_image_was_the_right_one_is_counted_apart():
+    true, mirrored = (pose(exp_so3([0.0, tilt, 0.0]), [0.0, 0.0, 1.0]) for tilt in (0.3, -0.3))
+    planar = PlanarPose(mirrored, 0.02, 0.7), PlanarPose(true, 0.02, 0.3)
+    seen = Detection("astratag", 3, np.zeros((4, 2)), (), 1.0, 0, "planar", planar, mirrored, np.eye(6))
+    cell = Consistency()
+    cell.add(seen, true)
+    cell.add(replace(seen, T_cam_marker=true, planar_poses=planar[1:]), true)
+    assert (cell.other_pose, cell.other_pose_expected, cell.nees) == (1, pytest.approx(0.3), [pytest.approx(0.0)])
 
 
 def test_the_same_seed_draws_the_same_picture():

@@ -17,7 +17,7 @@ import json
 import multiprocessing
 import platform
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
@@ -27,15 +27,16 @@ from rich.table import Table
 
 from benchmarks.detection.clutter import measure_clutter
 from benchmarks.detection.cost import measure_cost
+from benchmarks.detection.covariance import CELLS, CONFIDENCE, SURFACES, measure_covariance
 from benchmarks.detection.false_accepts import FIRST_SEED, measure_false_accepts
-from benchmarks.detection.figures import draw_condition, draw_cost, rows_of
+from benchmarks.detection.figures import draw_condition, draw_cost, draw_covariance, rows_of
 from benchmarks.detection.peers import ENTRANTS, TRACKED, Entrant
 from benchmarks.detection.profile import measure_profile
 from benchmarks.detection.recall import SIZES, measure
 from benchmarks.detection.scenes import CONDITIONS, Condition
 
 REAL_FRAMES = Path(__file__).resolve().parents[3] / "shared" / "reference" / "frames"
-PARTS = (*(condition.name for condition in CONDITIONS), "cost", "clutter", "profile", "false-accepts")
+PARTS = (*(condition.name for condition in CONDITIONS), "covariance", "cost", "clutter", "profile", "false-accepts")
 CONSOLE = Console(width=200)
 
 
@@ -47,19 +48,36 @@ def recall(
         return
     names = tuple(entrant.name for entrant in entrants)
     rows: dict[str, list[dict]] = {condition.name: [] for condition in conditions}
+    cells = [(c.name, value, images, names) for c in conditions for value in c.values]
+    left = Counter(name for name, *_ in cells)
+    named = {condition.name: condition for condition in conditions}
+    for (name, *_), measured in side_by_side(measure, cells, processes, f"recall, {images} images a cell"):
+        rows[name] += measured
+        left[name] -= 1
+        if not left[name]:
+            yield named[name], rows[name]
+
+
+def covariances(images: int, processes: int) -> list[dict]:
+    """Return the rows of all cells whose covariances are looked at, in their order."""
+    cells = [(name, value, images) for name, values in CELLS.items() for value in values]
+    description = f"covariances, {images} images a cell"
+    rows = dict(side_by_side(measure_covariance, cells, processes, description))
+    return [row for cell in cells for row in rows[cell]]
+
+
+def side_by_side(
+    measure: Callable[..., list[dict]], cells: Sequence[tuple], processes: int, description: str
+) -> Iterator[tuple[tuple, list[dict]]]:
+    """Yield each cell, the arguments it is measured with, and its rows, as soon as one of the processes has them."""
     context = multiprocessing.get_context("spawn")
     with (
         ProcessPoolExecutor(processes, mp_context=context) as pool,
         Progress(*Progress.get_default_columns(), MofNCompleteColumn(), TimeElapsedColumn(), console=CONSOLE) as bar,
     ):
-        jobs = {pool.submit(measure, c.name, value, images, names): c for c in conditions for value in c.values}
-        left = Counter(condition.name for condition in jobs.values())
-        for job in bar.track(as_completed(jobs), len(jobs), description=f"recall, {images} images a cell"):
-            condition = jobs[job]
-            rows[condition.name] += job.result()
-            left[condition.name] -= 1
-            if not left[condition.name]:
-                yield condition, rows[condition.name]
+        jobs = {pool.submit(measure, *cell): cell for cell in cells}
+        for job in bar.track(as_completed(jobs), len(jobs), description=description):
+            yield jobs[job], job.result()
 
 
 def show_condition(condition: Condition, rows: Sequence[dict], entrants: Iterable[Entrant]) -> None:
@@ -85,6 +103,30 @@ def cell_text(row: dict) -> str:
     wrong = (f"!{row['wrong']} " if row["wrong"] else "") + (f"?{row['misplaced']} " if row["misplaced"] else "")
     corner = f" ({row['corner_rms_px']:.2f})" if row["corner_rms_px"] is not None else ""
     return f"{wrong}{100 * row['recall']:.0f}{corner}"
+
+
+def show_covariance(rows: Sequence[dict]) -> None:
+    """Print the mean NEES of each cell beside its band, and how often the other planar pose was the right one."""
+    title = (
+        f"NEES a degree of freedom, ! outside its {CONFIDENCE:.0%} band (other planar pose right, of so many expected)"
+    )
+    table = Table(title=title, title_justify="left", box=None)
+    for heading in ("", "", *(f"surface {surface}" for surface in SURFACES), "band"):
+        table.add_column(heading)
+    for name, values in CELLS.items():
+        for value in values:
+            mine = [row for row in rows if (row["condition"], row["value"]) == (name, value)]
+            low, high = mine[0]["nees_95"]
+            table.add_row(name, f"{value:g}", *(nees_text(row) for row in mine), f"{low:.2f} to {high:.2f}")
+    CONSOLE.print(table)
+    CONSOLE.print(f"first seeds: {', '.join(str(row['first_seed']) for row in rows[:: len(SURFACES)])}\n", style="dim")
+
+
+def nees_text(row: dict) -> str:
+    """Return one cell of that table."""
+    low, high = row["nees_95"]
+    other = f" ({row['other_pose']} of {row['other_pose_expected']:.1f})" if row["other_pose_expected"] >= 0.05 else ""
+    return f"{'' if low <= row['nees'] <= high else '!'}{row['nees']:.2f}{other}"
 
 
 def show_cost(rows: Sequence[dict]) -> None:
@@ -178,6 +220,10 @@ def main() -> None:
     if "profile" in parts:
         results["profile"] = profile = measure_profile(options.images)
         show_profile(profile)
+    if "covariance" in parts:
+        results["covariance"] = consistency = covariances(options.images, options.processes)
+        show_covariance(consistency)
+        draw_covariance(consistency, options.out)
     results["recall"] = measured = []
     for condition, rows in recall(conditions, options.images, options.processes, entrants):
         show_condition(condition, rows, entrants)

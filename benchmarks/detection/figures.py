@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.detection.peers import ENTRANTS, TRACKED
 from benchmarks.detection.recall import SIZES
-from benchmarks.detection.scenes import Condition
+from benchmarks.detection.scenes import CONDITIONS, Condition
 
 STYLES = {
     "AstraTag": ("#0072B2", "o", "-"),
@@ -59,6 +59,28 @@ def draw_condition(condition: Condition, rows: Sequence[dict], folder: Path) -> 
     panels[1, 0].set_ylabel("corner RMS a coordinate, px")
     figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
     return save(figure, folder / f"{condition.name}.png")
+
+
+def draw_covariance(rows: Sequence[dict], folder: Path) -> Path:
+    """Save the mean NEES of poses over each condition, with its chi-square band."""
+    figure = Figure(figsize=(13, 4), layout="constrained")
+    conditions = {condition.name: condition for condition in CONDITIONS}
+    names = list(dict.fromkeys(row["condition"] for row in rows))
+    panels = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
+    for axes, name in zip(panels, names, strict=True):
+        for surface, entrant in (("told", "AstraTag"), ("unknown", "AstraTag, surface unknown")):
+            mine = [row for row in rows if (row["condition"], row["surface"]) == (name, surface)]
+            colour, mark, line = STYLES[entrant]
+            at = range(len(mine))
+            axes.plot(at, [row["nees"] for row in mine], color=colour, marker=mark, linestyle=line, label=entrant)
+            if surface == "told":
+                low, high = zip(*(row["nees_95"] for row in mine), strict=True)
+                axes.fill_between(at, low, high, color="#999999", alpha=0.25, lw=0, label="95 % band of honest ones")
+                axes.set_xticks(at, [f"{row['value']:g}" for row in mine])
+        axes.set_xlabel(conditions[name].label, fontsize=8)
+    panels[0].set(ylabel="NEES a degree of freedom", ylim=(0, None))
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
+    return save(figure, folder / "covariance.png")
 
 
 def draw_cost(rows: Sequence[dict], folder: Path) -> Path:

@@ -86,10 +86,11 @@ class Draw:
     surface: Surface
     seed: int
 
-    def photograph(self, texture: Texture) -> NDArray[np.uint8]:
-        """Return the gray picture with a print in it."""
+    def photograph(self, texture: Texture, rays: int = 8) -> NDArray[np.uint8]:
+        """Return the gray picture with a print in it, of so many rays a pixel."""
         background = textured(self.scene.width_px, self.scene.height_px, self.seed % BACKGROUNDS)
-        light = lay_texture(light_behind(self.camera, background), self.camera, self.T_cam_print, texture, self.surface)
+        behind = light_behind(self.camera, background)
+        light = lay_texture(behind, self.camera, self.T_cam_print, texture, self.surface, rays)
         if self.scene.change is not None:
             grid = self.pixels(np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, GRID)] * 2), axis=-1) * SHEET_M)
             light = self.scene.change(light, grid, np.random.default_rng([self.seed, 1]))
