@@ -48,7 +48,7 @@ WARPS = 2 * len(LAYERS)
 """How often a candidate is read whose edges are measured: in each layer, in even light and relit."""
 PIXEL_BLUR = 0.95
 """Blur from which squares are matched, pixels: a good lens's, and what sampling between pixels adds."""
-POLISHED_TO_PX = 0.03
+POLISHED_TO_PX = 0.08
 """The step after one that moved a print by less would move it by a hundredth of a pixel."""
 FOUND_PX, POLISHED_PX, LEAST_POLISHED = 56.0, 90.0, 0.95
 """Markers that look smaller are measured by all their pixels, not by their edges, where these look right.

@@ -17,9 +17,9 @@ Mask = NDArray[np.bool_]
 
 SHARP_REACH_PX = 4.0
 """An edge this far from its neighbours is sharp; nearer, they pull."""
-PULL_PX, PULL_FLOOR_PX = 0.023, 0.002
+PULL_PX, PULL_FLOOR_PX = 0.023, 0.0005
 """How far a whole edge may be off when its neighbours are as near as ``SHARP_REACH_PX``, and at least."""
-PULL_REST, SHORT_PX2, PULL_GROWTH = 0.06, 0.2, 2.0
+PULL_REST, SHORT_PX2, PULL_GROWTH = 0.08, 0.25, 2.0
 """How wrong a pull is that is known, as a fraction of it; how far a whole edge is off besides, times the length it is
 seen at, for what is beside it is not much longer; how much faster than a weak pull a strong one grows with blur."""
 BACKGROUND = 0.12
