@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import fill
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -77,7 +78,7 @@ def draw_covariance(rows: Sequence[dict], folder: Path) -> Path:
                 low, high = zip(*(row["nees_95"] for row in mine), strict=True)
                 axes.fill_between(at, low, high, color="#999999", alpha=0.25, lw=0, label="95 % band of honest ones")
                 axes.set_xticks(at, [f"{row['value']:g}" for row in mine])
-        axes.set_xlabel(conditions[name].label, fontsize=8)
+        axes.set_xlabel(fill(conditions[name].label, width=30), fontsize=8)
     panels[0].set(ylabel="NEES a degree of freedom", ylim=(0, None))
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
     return save(figure, folder / "covariance.png")
