@@ -1,6 +1,6 @@
 """Fitting a warp to the edges of a marker, robustly.
 
-Residuals are distances across the edges, in pixels.  Besides the warp's own parameters the fit carries one
+Residuals are distances across the edges, in pixels.  Besides the warp's own parameters the fit carries an
 *edge bias*: how far all edges lie towards the paper.  What is left of a camera's response curve moves every
 black-white edge the same way, and black squares and white frames feel it with opposite signs.
 """
@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 W = TypeVar("W", bound=FittedWarp)
 
-BIAS_SIGMA_PX = 0.04
+BIAS_SIGMA_PX = 0.02
 """Prior standard deviation of the edge bias: what a known response curve leaves."""
 NOISE_FLOOR_PX = 0.01
 """No edge point is believed to be better than this."""
@@ -36,8 +36,10 @@ FIRST_SIGMA_PX = 0.3
 """What the noise is taken for at first: so much that all points count alike."""
 CORRELATION_LENGTH_PX = 1.6
 """Edge points nearer than this along an edge share their noise (blur, JPEG blocks)."""
-NUISANCE_SIGMA = np.array([BIAS_SIGMA_PX, 0.15])
-"""Prior standard deviations of the edge bias, and of how wrong what is known of all pulls is, as a fraction of them."""
+NUISANCE_SIGMA = np.array([BIAS_SIGMA_PX, 0.15, 0.03])
+"""Prior standard deviations of the edge bias, of how wrong what is known of all pulls is, as a fraction of them, and of
+how far edges that are pulled by ``WHOLLY_PX`` or more lie towards the paper besides: they do not tell the bias."""
+WHOLLY_PX = 0.1
 NUISANCES = len(NUISANCE_SIGMA)
 _PARAMETERS = slice(0, -NUISANCES)
 LEAST_CURVING = 0.3
@@ -149,7 +151,8 @@ def _measured(
     """Return which N of all points of E edges are measured, none when that is too few, and what is known of them.
 
     That are their offsets less what neighbours pull them by, keenness, shares of what they tell for themselves, being
-    on an edge that looks short, variances and growths of pulls (5, N).  Then of all points where they were measured
+    on an edge that looks short, variances and growths of pulls, and how far they are pulled ones (6, N).  Then of all
+    points where they were measured
     and the normals there (2, E M); of edges the reach (E,); and how many points on sharp ones are in view.
     """
     seen = locate(gray, of_gray, probes_px, facing, to_paper, reach, spacing, outside, search_px)
@@ -184,7 +187,7 @@ def _measured(
     if _on_all_sides(edges, use & ~known.lost):
         use &= ~known.lost
     count, i, sharp = np.count_nonzero(use), 0, 0
-    used, points = np.empty(count, np.int64), np.empty((5, count))
+    used, points = np.empty(count, np.int64), np.empty((6, count))
     places_px, normal = np.empty((2, use.size)), np.empty((2, use.size))
     for e in range(use.shape[0]):
         share = min(1.0, seen.length_px[e] / (POINTS_PER_EDGE * CORRELATION_LENGTH_PX))
@@ -196,6 +199,7 @@ def _measured(
             if use[e, m]:
                 used[i], points[0, i], points[1, i], points[2, i] = k, offset_px, known.keen[e, m], share
                 points[3, i], points[4, i] = known.variance[e, m], known.growth[e, m]
+                points[5, i] = min(abs(known.pull_px[e, m]) / WHOLLY_PX, 1.0)
                 i += 1
         if seen.reach_px[e] >= SHARP_REACH_PX:
             sharp += int(np.count_nonzero(seen.in_view[e]))
@@ -289,8 +293,8 @@ def _solved(
 
     ``slopes`` (P, all) are what they feel of the parameters, known to be 0 within ``step_sigma`` (P,) beforehand;
     ``points`` is what is known of them and ``left`` (N,) how far they are from their places.  First what they feel
-    (P + 2, N) of the parameters and of the nuisance, bias and wrong pulls; then the unknowns (P + 2,), final weights
-    (N,) in 1 / px^2, and the covariance (P + 2, P + 2).
+    (P + 3, N) of the parameters and of the nuisance, bias and wrong pulls; then the unknowns (P + 3,), final weights
+    (N,) in 1 / px^2, and the covariance (P + 3, P + 3).
     """
     size = len(slopes)
     A, prior_sigma = np.empty((size + NUISANCES, len(used))), np.empty(size + NUISANCES)
@@ -298,7 +302,7 @@ def _solved(
     for i in range(len(used)):
         for p in range(size):
             A[p, i] = slopes[p, used[i]]
-        A[size, i], A[size + 1, i] = 1.0, points[4, i]
+        A[size, i], A[size + 1, i], A[size + 2, i] = 1.0, points[4, i], points[5, i]
     x, weight, covariance = _robust_least_squares(A, left, points[1], points[2], points[3], prior_sigma)
     return bool(np.isfinite(x).all()), A, x, weight, covariance
 
@@ -309,7 +313,7 @@ def _left(
 ) -> tuple[Array, float]:
     """Return how far N points now are (all, 2) from their places (2, all), and most by how much that is a surprise.
 
-    It was ``before`` (N,), and should have changed by a step: the unknowns ``x`` (P + 2,) but for the nuisance.
+    It was ``before`` (N,), and should have changed by a step: the unknowns ``x`` (P + 3,) but for the nuisance.
     """
     left, surprise_px = np.empty(len(used)), 0.0
     for i in range(len(used)):
