@@ -152,8 +152,8 @@ def _measured(
 
     That are their offsets less what neighbours pull them by, keenness, shares of what they tell for themselves, being
     on an edge that looks short, variances and growths of pulls, and how far they are pulled ones (6, N).  Then of all
-    points where they were measured
-    and the normals there (2, E M); of edges the reach (E,); and how many points on sharp ones are in view.
+    points where they were measured and the normals there (2, E M); of edges the reach (E,); and how many points on
+    sharp ones are in view.
     """
     seen = locate(gray, of_gray, probes_px, facing, to_paper, reach, spacing, outside, search_px)
     use = _usable(seen.found, seen.in_view, seen.reach_px)
