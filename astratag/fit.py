@@ -29,7 +29,8 @@ Mask = NDArray[np.bool_]
 W = TypeVar("W", bound=FittedWarp)
 
 BIAS_SIGMA_PX = 0.02
-"""Prior standard deviation of the edge bias: what a known response curve leaves."""
+"""Prior standard deviation of the edge bias: what a known response curve leaves.  Chosen on renders, whose curve is
+known exactly; a real camera may leave more."""
 NOISE_FLOOR_PX = 0.01
 """No edge point is believed to be better than this."""
 FIRST_SIGMA_PX = 0.3

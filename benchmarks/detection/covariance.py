@@ -38,8 +38,8 @@ RAYS = 32
 CONFIDENCE, DEGREES_OF_FREEDOM = 0.95, 6
 OTHER_RAD = 0.02
 """Planar poses turned by more are two."""
-FIRST_SEED = 7000
-"""Added to what recall starts from: other pictures than the detector was judged by there."""
+FIRST_SEED = 5_000_000
+"""Added to what recall starts from: pictures that no constant of the detector was chosen on."""
 
 
 @dataclass
