@@ -26,7 +26,7 @@ from astratag.geometry import LAYERS, SQUARES, TEMPLATE_UNITS, layer_points, squ
 from astratag.grow import Fit, settle
 from astratag.layers import measure_layers
 from astratag.matching import INDEPENDENT_CELLS, acceptance_of_pixels
-from astratag.neighbours import Crossings, crossings
+from astratag.neighbours import Crossings, all_crossings, crossings
 from astratag.pose import planar_poses, refine_on_corners
 from astratag.relight import RELIT_SAMPLES, relit_layer
 from astratag.signature import LEAST_SEEN, Artwork, Codebook, Reading, layer_cells
@@ -101,6 +101,7 @@ class Describer:
         self._artwork = Artwork(self.dictionary)
         self._synthesis = Synthesis(self.dictionary)
         self._accept_of_pixels = acceptance_of_pixels(4 * len(self.dictionary), false_accept_rate)
+        all_crossings()  # listed now, not when the first marker is seen
 
     def spec(self, marker_id: int) -> MarkerSpec:
         """Return how a marker was made."""

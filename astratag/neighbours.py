@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from astratag.compiled import CUBE, MATRIX, compiled
 from astratag.edges import EDGE_DIRECTION, EDGE_POINTS, EDGE_REACH, EDGES, INK_TO_PAPER, POINTS_PER_EDGE
 from astratag.geometry import CELLS, DRAWN_OFFSET, LAYERS, cell_polygons, layer_points
 
@@ -30,6 +31,10 @@ LEAST_TURNED = 0.02
 BESIDE_UNITS = 0.02
 """How far before and after a crossing to look at what is there."""
 FAR = 1e6
+CELLS_OF_LAYERS = np.stack([layer_points(cell_polygons() + DRAWN_OFFSET, layer) for layer in LAYERS])
+"""The triangles (3, 48, 3, 2) of all layers, template units."""
+SIDES_OF_LAYERS = np.array([(*(layer.frame or layer.black), *layer.black) for layer in LAYERS], dtype=float)
+"""Near and far side (3, 4) of each layer's frame, and of its black square."""
 
 
 class Crossings(NamedTuple):
@@ -50,7 +55,7 @@ class Crossings(NamedTuple):
 def crossings(code: bytes) -> Crossings:
     """Return the crossings that change the brightness in a print whose 48 bits are ``code``."""
     bright = np.append(np.frombuffer(code, dtype=np.uint8).astype(float), (1.0, 0.0))  # cells, paper, ink
-    distance, skew, before, after = _all_crossings()
+    distance, skew, before, after = all_crossings()
     jump = np.where(np.isfinite(distance), bright[after] - bright[before], 0.0)
     nearest = np.argsort(np.where(jump != 0, np.abs(distance), np.inf), axis=2, kind="stable")[..., :MOST_CROSSINGS]
     d, j, k = (np.ascontiguousarray(np.take_along_axis(part, nearest, axis=2)) for part in (distance, jump, skew))
@@ -62,8 +67,11 @@ UNKNOWN = Crossings(*np.zeros((3, 0, POINTS_PER_EDGE, MOST_CROSSINGS)))
 
 
 @cache
-def _all_crossings() -> tuple[Array, Array, NDArray[np.int64], NDArray[np.int64]]:
-    """Return distances, skews and the labels before and after of all crossings (S E, M, many); distance inf is none."""
+def all_crossings() -> tuple[Array, Array, NDArray[np.int64], NDArray[np.int64]]:
+    """Return distances, skews and the labels before and after of all crossings (S E, M, many); distance inf is none.
+
+    That takes 0.1 s, once.
+    """
     distance, skew, before, after = zip(*(_crossings_of(float(lean)) for lean in LEANS), strict=True)
     most = max(part.shape[2] for part in distance)
     return (
@@ -104,35 +112,45 @@ def _crossings_of(lean: float) -> tuple[Array, Array, NDArray[np.int64], NDArray
     handed = along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0]
     skew = handed * (side[:, 0] * across[..., 0] + side[:, 1] * across[..., 1]) / slanted
     skew = np.take_along_axis(np.broadcast_to(skew, away.shape[:3]), order, axis=2)
-    finite = np.where(np.isfinite(distance), distance, 0.0)[..., None]
-    before, after = (_label(EDGE_POINTS[:, :, None, :] + (finite + by * BESIDE_UNITS) * line) for by in (-1, 1))
+    there = np.isfinite(distance)
+    edge, point, _ = np.nonzero(there)
+    before, after = np.full((2, *distance.shape), INK)
+    for labels, by in ((before, -BESIDE_UNITS), (after, BESIDE_UNITS)):
+        places = EDGE_POINTS[edge, point] + (distance[there] + by)[:, None] * line[edge, 0, 0]
+        labels[there] = _label(places, SIDES_OF_LAYERS, CELLS_OF_LAYERS.reshape(len(LAYERS), CELLS, 6))
     return distance, skew, before, after
-
-
-def _triangles() -> Array:
-    """Return the cells of all layers (3, 48, 3, 2), template units."""
-    return np.stack([layer_points(cell_polygons() + DRAWN_OFFSET, layer) for layer in LAYERS])
 
 
 def _segments() -> tuple[Array, Array]:
     """Return start and end (S, 2) of all straight edges of the print."""
-    triangles = _triangles().reshape(-1, 3, 2)
+    triangles = CELLS_OF_LAYERS.reshape(-1, 3, 2)
     ends = np.roll(triangles, -1, axis=1)
     sides = [np.array([edge.start for edge in EDGES]), np.array([edge.end for edge in EDGES])]
     return np.concatenate([sides[0], triangles.reshape(-1, 2)]), np.concatenate([sides[1], ends.reshape(-1, 2)])
 
 
-def _label(points: Array) -> NDArray[np.int64]:
-    """Return what is at template points (..., 2): a cell's number, ``PAPER`` or ``INK``."""
-    flat = points.reshape(-1, 2)
-    label = np.full(len(flat), PAPER)
-    for layer, cells in zip(LAYERS, _triangles(), strict=True):
-        for (near, far), what in ((layer.frame or layer.black, PAPER), (layer.black, INK)):
-            label[((flat > near) & (flat < far)).all(axis=1)] = what
-        inside = np.flatnonzero(((flat > layer.black[0]) & (flat < layer.black[1])).all(axis=1))
-        x, y = flat[inside].T
-        for cell, corners in enumerate(cells):
-            edges = np.roll(corners, -1, axis=0) - corners
-            turns = [ex * (y - ay) - ey * (x - ax) for (ax, ay), (ex, ey) in zip(corners, edges, strict=True)]
-            label[inside[(np.sign(turns[0]) == np.sign(turns[1])) & (np.sign(turns[1]) == np.sign(turns[2]))]] = cell
-    return label.reshape(points.shape[:-1])
+@compiled(MATRIX, MATRIX, CUBE)
+def _label(points: Array, squares: Array, cells: Array) -> NDArray[np.int64]:
+    """Return what is at template points (N, 2): a cell's number, ``PAPER`` or ``INK``.
+
+    ``squares`` (3, 4) are near and far side of each layer's frame, and of its black square; ``cells`` (3, 48, 6) the
+    corners of its triangles.
+    """
+    label = np.full(len(points), PAPER)
+    for i in range(len(points)):
+        x, y = points[i]
+        for layer in range(len(squares)):
+            if not (squares[layer, 0] < min(x, y) and max(x, y) < squares[layer, 1]):
+                break
+            label[i] = PAPER
+            if not (squares[layer, 2] < min(x, y) and max(x, y) < squares[layer, 3]):
+                break
+            label[i] = INK
+            for cell in range(CELLS):
+                ax, ay, bx, by, cx, cy = cells[layer, cell]
+                ab = (bx - ax) * (y - ay) > (by - ay) * (x - ax)
+                bc = (cx - bx) * (y - by) > (cy - by) * (x - bx)
+                ca = (ax - cx) * (y - cy) > (ay - cy) * (x - cx)
+                if ab == bc and bc == ca:
+                    label[i] = cell
+    return label
