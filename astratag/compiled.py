@@ -47,6 +47,7 @@ FLAGS, FLAG_MATRIX = array(BOOL, 1), array(BOOL, 2)
 INDICES, INDEX_MATRIX = array(INT, 1), array(INT, 2)
 BITS = array(types.uint8, 2)
 TABLE = array(types.int32, 2)
+LINES, LINE_NUMBERS, BELLS = array(SINGLE, 4), array(INT, 3), array(REAL, 4)
 """All in C order, and only read."""
 INTO_SHAPES, INTO_POINTS = types.Array(types.uint8, 2, "C"), types.Array(types.int32, 2, "C")
 """Shapes (H, W) and pixels (N, 2) that are written to as well."""

@@ -211,7 +211,7 @@ class Confirmer(Describer):
     def _fitted(self, view: View, candidate: Candidate, fit: Fit, looks: Array) -> Detection | None:
         """Return the marker that a candidate is by a fit, None when it does not read or look so."""
         marker_id = candidate.reading.marker_id
-        if self.spec(marker_id).surface is None and not isinstance(fit.warp, PoseWarp | CylinderWarp):
+        if self.spec(marker_id).surface is None and not isinstance(fit.warp, CylinderWarp):
             as_seen = self._as_bent_as_seen(view, marker_id, fit, float(looks[0]))
             if as_seen is not fit:
                 fit, looks = as_seen, self._artwork.layer_scores(view.gray, as_seen.warp, marker_id)
@@ -229,7 +229,8 @@ class Confirmer(Describer):
             return None
         if not detection.layers and not follows_all_sides(fit):
             return None  # nothing says where it is
-        return self.polished(view, self.with_other_pose(view, detection, fit), FOUND_PX)
+        surface = fit.warp.surface if isinstance(fit.warp, PoseWarp) else None
+        return self.polished(view, self.with_other_pose(view, detection, fit), FOUND_PX, surface)
 
     def _as_bent_as_seen(self, view: View, marker_id: int, fit: Fit, likeness: float) -> Fit:
         """Return the simplest fit that explains a print on an unknown surface: a plane's, a cylinder's, or as it was.
@@ -296,7 +297,8 @@ class Confirmer(Describer):
                         settled = settle(view.light, warp, self.near(marker_id))  # others should be near, too
                         if settled is not None and settled.cost < COST_LIMIT:
                             return settled
-                    return grow(view.light, warp, layer, self.near(marker_id))
+                    posed = partial(self.pose_of_plane, view, marker_id)
+                    return grow(view.light, warp, layer, self.near(marker_id), posed)
         return None
 
     def _starts(self, view: View, candidate: Candidate, layer: int) -> Iterator[FittedWarp]:

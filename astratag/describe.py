@@ -27,7 +27,7 @@ from astratag.grow import Fit, settle
 from astratag.layers import measure_layers
 from astratag.matching import INDEPENDENT_CELLS, acceptance_of_pixels
 from astratag.neighbours import Crossings, all_crossings, crossings
-from astratag.pose import planar_poses, refine_on_corners
+from astratag.pose import planar_poses, poses_from_square, refine_on_corners
 from astratag.relight import RELIT_SAMPLES, relit_layer
 from astratag.signature import LEAST_SEEN, Artwork, Codebook, Reading, layer_cells
 from astratag.surface import Cylinder, Flat, Surface
@@ -214,22 +214,26 @@ class Describer:
         planar = before.planar_poses if before is not None and is_pose else ()
         return self._described(view, reading, aligned.warp, layers, method, covariance, planar)
 
-    def polished(self, view: View, detection: Detection, below_px: float) -> Detection:
-        """Return a detection measured again by all its pixels when it looks small: from each pose its corners allow."""
+    def polished(self, view: View, detection: Detection, below_px: float, surface: Surface | None = None) -> Detection:
+        """Return a detection measured again by all its pixels when it looks small: from each pose its corners allow.
+
+        ``surface`` is what it was found to be on, if that is not known beforehand.
+        """
         if detection.method in ("tps", "cylinder") and self.spec(detection.marker_id).surface is None:
             return detection
         if sides_of(detection.corners_px)[0] >= below_px:
             return detection
         spec = self.spec(detection.marker_id)
+        surface = spec.surface or surface
         starts: list[FittedWarp] = [HomographyWarp.from_points(OUTER, detection.corners_px)]
-        if view.camera is not None and spec.surface is not None and detection.T_cam_marker is not None:
+        if view.camera is not None and surface is not None and detection.T_cam_marker is not None:
             mirrored = [
                 planar.T_cam_marker
                 for planar in detection.planar_poses
                 if planar.probability > IMPOSSIBLE and _apart(planar.T_cam_marker, detection.T_cam_marker)
             ]
             poses = [detection.T_cam_marker, *mirrored]
-            starts = [PoseWarp(view.camera, spec.side_m, spec.surface, T_cam_marker) for T_cam_marker in poses]
+            starts = [PoseWarp(view.camera, spec.side_m, surface, T_cam_marker) for T_cam_marker in poses]
         align = partial(self._synthesis.align, settled_px=POLISHED_TO_PX)
         aligned = [align(view.lit, start, detection.marker_id, PIXEL_BLUR) for start in starts]
         best = max((one for one in aligned if one is not None), key=lambda one: one.correlation, default=None)
@@ -240,6 +244,14 @@ class Describer:
         if again is None:
             return detection
         return replace(again, planar_poses=detection.planar_poses or again.planar_poses)
+
+    def pose_of_plane(self, view: View, marker_id: int, warp: FittedWarp) -> PoseWarp | None:
+        """Return the pose that sees a marker of unknown surface where a plane's warp does; None without a camera."""
+        spec = self.spec(marker_id)
+        if view.camera is None or spec.surface is not None:
+            return None
+        poses = poses_from_square(view.camera, OUTER, warp(OUTER), spec.side_m, Flat())
+        return PoseWarp(view.camera, spec.side_m, Flat(), poses[0]) if poses else None
 
     def with_other_pose(self, view: View, detection: Detection, fit: Fit) -> Detection:
         """Return the detection fitted from the other planar pose when corners allow both and the edges prefer it."""

@@ -15,7 +15,20 @@ from numpy.typing import NDArray
 
 from astratag.backdrop import backdrop
 from astratag.bells import around
-from astratag.compiled import CUBE, FLAG_MATRIX, FLAGS, GRAY, INDICES, INT, MATRIX, REAL, VECTOR, compiled
+from astratag.compiled import (
+    CUBE,
+    FLAG_MATRIX,
+    FLAGS,
+    GRAY,
+    INDICES,
+    INT,
+    LINE_NUMBERS,
+    LINES,
+    MATRIX,
+    REAL,
+    VECTOR,
+    compiled,
+)
 from astratag.edges import POINTS_PER_EDGE, template_of
 from astratag.locate import locate
 from astratag.neighbours import UNKNOWN, Crossings
@@ -44,8 +57,9 @@ WHOLLY_PX = 0.1
 NUISANCES = len(NUISANCE_SIGMA)
 _PARAMETERS = slice(0, -NUISANCES)
 LEAST_CURVING = 0.3
-TUKEY = 4.685
-"""Residuals beyond this many standard deviations weigh nothing (95 % efficiency on Gaussian noise)."""
+TUKEY, OF_GAUSSIAN = 4.685, 0.963
+"""Residuals beyond this many standard deviations weigh nothing (95 % efficiency on Gaussian noise); and how much larger
+the variance then is than weights promise, for these are less than 1 on average."""
 REWEIGHTINGS, SAME_SPREAD = 5, 0.02
 """Weights are found again until the residuals' spread changes by no more than this fraction."""
 MAX_STEPS, LINEAR_PX = 6, 0.01
@@ -93,7 +107,7 @@ def fit_edges(
     """
     template, before = template_of(edges), warp
     probes_px, facing = warp(template.probes), warp.visible(template.few)
-    found = _measured(*light, probes_px, facing, edges, *template[3:], *near, search_px)
+    found = _measured(*light, probes_px, facing, edges, *template[3:], near.places, near.which, near.jump, search_px)
     used, points, places_px, normal, reach_px, sharp = found
     if len(used) == 0:
         return None
@@ -133,7 +147,7 @@ def _on_all_sides(edges: NDArray[np.int64], use: Mask) -> bool:
     return bool(followed.all())
 
 
-@compiled(GRAY, VECTOR, CUBE, FLAGS, INDICES, VECTOR, VECTOR, VECTOR, VECTOR, CUBE, CUBE, CUBE, REAL)
+@compiled(GRAY, VECTOR, CUBE, FLAGS, INDICES, VECTOR, VECTOR, VECTOR, VECTOR, LINES, LINE_NUMBERS, VECTOR, REAL)
 def _measured(
     gray: NDArray[np.uint8],
     of_gray: Array,
@@ -144,9 +158,9 @@ def _measured(
     reach: Array,
     spacing: Array,
     outside: Array,
-    distance: Array,
+    places: NDArray[np.float32],
+    which: NDArray[np.int64],
     jump: Array,
-    skew: Array,
     search_px: float,
 ) -> tuple[NDArray[np.int64], Array, Array, Array, Array, int]:
     """Return which N of all points of E edges are measured, none when that is too few, and what is known of them.
@@ -161,9 +175,9 @@ def _measured(
     if not _on_all_sides(edges, use):
         use[:] = False
     beside = around(
-        distance,
+        places,
+        which,
         jump,
-        skew,
         edges,
         seen.unit_px,
         seen.growth_px,
@@ -171,12 +185,13 @@ def _measured(
         seen.squeeze,
         seen.margin_px,
         backdrop(gray, of_gray, edges, seen.predicted_px, seen.normal, seen.margin_px, seen.blur_px),
+        seen.blur_px,
+        seen.beside_px,
         within_reach(seen.reach_px, seen.blur_px, use | seen.alone),
     )
     known = pulls_on(
         beside,
         edges,
-        seen.length_px,
         seen.reach_px,
         seen.margin_px,
         seen.clipped_px,
@@ -192,13 +207,14 @@ def _measured(
     places_px, normal = np.empty((2, use.size)), np.empty((2, use.size))
     for e in range(use.shape[0]):
         share = min(1.0, seen.length_px[e] / (POINTS_PER_EDGE * CORRELATION_LENGTH_PX))
+        quieter = np.sqrt(float(seen.rows[e]))
         for m in range(POINTS_PER_EDGE):
             k, offset_px = e * POINTS_PER_EDGE + m, seen.offset_px[e, m] - known.pull_px[e, m]
             for axis in range(2):
                 normal[axis, k] = seen.normal[axis, e, m]
                 places_px[axis, k] = seen.predicted_px[axis, e, m] + offset_px * normal[axis, k]
             if use[e, m]:
-                used[i], points[0, i], points[1, i], points[2, i] = k, offset_px, known.keen[e, m], share
+                used[i], points[0, i], points[1, i], points[2, i] = k, offset_px, known.keen[e, m] * quieter, share
                 points[3, i], points[4, i] = known.variance[e, m], known.growth[e, m]
                 points[5, i] = min(abs(known.pull_px[e, m]) / WHOLLY_PX, 1.0)
                 i += 1
@@ -221,7 +237,7 @@ def _of_tukey(u2: Array, unknowns: int) -> float:
         felt += TUKEY**2 * u2[i] * less**4 / points
         weights += less**2
     promised = felt * weights / max(curving, LEAST_CURVING) ** 2 / max(points - unknowns, 1)
-    return max(promised, 1.0)
+    return max(promised, OF_GAUSSIAN)
 
 
 @compiled(VECTOR, FLAGS)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from astratag.edges import EDGE_LAYER, EDGES
@@ -9,9 +11,11 @@ from astratag.fit import EdgeFit, fit_edges
 from astratag.geometry import SQUARES
 from astratag.neighbours import Crossings
 from astratag.sampling import Light
-from astratag.warp import BentWarp, FittedWarp, HomographyWarp, sides_of
+from astratag.warp import BentWarp, FittedWarp, HomographyWarp, PoseWarp, sides_of
 
 Fit = EdgeFit[FittedWarp]
+Posed = Callable[[FittedWarp], PoseWarp | None]
+"""From a warp of a plane to the pose that sees it so, None if there is none."""
 
 ALL_EDGES = np.arange(len(EDGES))
 SETTLE_PX = 2.0
@@ -35,14 +39,14 @@ def fit_own_edges(light: Light, warp: FittedWarp, layer: int) -> Fit | None:
     return fit_edges(light, warp, ALL_EDGES[layer == EDGE_LAYER], _search_px(warp, layer, 0.03))
 
 
-def grow(light: Light, warp: FittedWarp, layer: int, near: Crossings) -> Fit | None:
+def grow(light: Light, warp: FittedWarp, layer: int, near: Crossings, posed: Posed | None = None) -> Fit | None:
     """Return the fit to all edges in view, begun with a warp fitted to one layer.
 
     On a surface that is not known the warp may bend as it grows, and stays flat if that explains the edges, or if only
-    one layer is seen: its edges do not tell how the inside lies.
+    one layer is seen: its edges do not tell how the inside lies.  A flat one is ``posed`` where a pose explains them.
     """
     search_px = _search_px(warp, layer, 0.02)
-    flat = _grow_through(light, warp, layer, search_px, near)
+    flat = _grow_through(light, warp, layer, search_px, near, posed)
     if not isinstance(warp, HomographyWarp) or (flat is not None and flat.cost < SURELY_FLAT):
         return flat
     bent = _grow_through(light, BentWarp(warp, np.zeros((2, 3))), layer, search_px, near)
@@ -52,15 +56,22 @@ def grow(light: Light, warp: FittedWarp, layer: int, near: Crossings) -> Fit | N
     return bent if several and bent.cost < CURVED_GAIN * flat.cost else flat
 
 
-def _grow_through(light: Light, warp: FittedWarp, layer: int, search_px: float, near: Crossings) -> Fit | None:
-    """Return the settled fit after taking in the nearest layers, then all."""
+def _grow_through(
+    light: Light, warp: FittedWarp, layer: int, search_px: float, near: Crossings, posed: Posed | None = None
+) -> Fit | None:
+    """Return the settled fit after taking in the nearest layers, then all; that of the ``posed`` warp if it is one."""
     nearest = ALL_EDGES[np.abs(EDGE_LAYER - layer) <= 1]
     for edges in (nearest, ALL_EDGES) if layer > 0 else (ALL_EDGES,):
         fit = fit_edges(light, warp, edges, search_px)
         if fit is None:
             return None
         warp = fit.warp
-    return settle(light, warp, near)
+    pose = posed(warp) if posed is not None else None
+    as_pose = settle(light, pose, near) if pose is not None else None
+    if as_pose is not None and as_pose.cost < SURELY_FLAT:
+        return as_pose
+    fit = settle(light, warp, near)
+    return as_pose if fit is None or (as_pose is not None and CURVED_GAIN * as_pose.cost < fit.cost) else fit
 
 
 def settle(light: Light, warp: FittedWarp, near: Crossings) -> Fit | None:

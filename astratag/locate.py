@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.compiled import CUBE, FLAG_MATRIX, FLAGS, GRAY, INT, MATRIX, REAL, VECTOR, compiled
+from astratag.compiled import CUBE, FLAG_MATRIX, FLAGS, GRAY, INDICES, INT, INTO_MATRIX, MATRIX, REAL, VECTOR, compiled
 from astratag.edges import ALONG_SHARE, FEW_INTERVALS, POINTS_PER_EDGE
 from astratag.normal import ranked
 from astratag.sampling import light_between
@@ -24,6 +24,11 @@ SMOOTHING_PX = 0.7
 """Standard deviation of the derivative filter: little, so that neighbouring edges do not pull."""
 WITHIN_REACH = 0.6
 """An edge is looked for this fraction of the way to its nearest neighbour."""
+ROW_PX, MOST_ROWS, ROWS_WITHIN_PX, ROWS_REACH_PX = 1.6, 5, 2.0, 4.0
+"""Points of an edge far apart are looked at in several rows side by side, so far from each other that their noise is
+their own: where they are looked for so near, and neighbours are so far away."""
+LEAST_LENS_PX = 0.4
+"""Lens, pixel and interpolation blur by no less."""
 FAR_PX = 1e6
 """No image reaches so far."""
 MOST_ALONE = 0.8
@@ -61,7 +66,8 @@ class Edges(NamedTuple):
     ``offset_px`` (E, M) is the distance from there along the normals; only where ``found``, which is only where
     ``in_view``.  The points ``alone`` (E, M) are those furthest from their neighbours; ``blur_px`` is the standard
     deviation of all that blurs these: lens, pixel, interpolation, derivative filter, and neighbours a little.
-    ``clipped_px`` (E, M) is how far saturation may have moved the edge.
+    ``clipped_px`` (E, M) is how far saturation may have moved the edge.  Each point is the mean of ``rows`` (E,) side
+    by side, which blur along the edge, as the lens does and the filter does not: by ``beside_px`` (E,).
     """
 
     predicted_px: Array
@@ -79,6 +85,8 @@ class Edges(NamedTuple):
     alone: Mask
     blur_px: float
     clipped_px: Array
+    rows: NDArray[np.int64]
+    beside_px: Array
 
 
 @compiled(CUBE, VECTOR, VECTOR, VECTOR, VECTOR)
@@ -114,6 +122,9 @@ def _lie(
             squeezes[k] = across[k] / along_px[k * few]
             outwards[k] = (outer[0] - x) * nx + (outer[1] - y) * ny
             growths[k] = (outwards[k] / outside[e] - to_paper[e] * across[k]) / outside[e]
+        for k in range(FEW_INTERVALS + 1):  # the line leans, and units grow along the edge as well
+            before, after = max(k - 1, 0), min(k + 1, FEW_INTERVALS)
+            growths[k] += leans[k] * (across[after] - across[before]) / ((after - before) * few * spacing[e])
         # how far apart neighbouring edges look, where that is least: small when the print is seen at a slant
         reach_px[e] = reach[e] * across.min()
         for m in range(points):
@@ -156,22 +167,25 @@ def _derivative(smoothing_px: float) -> Array:
     return weights / moment
 
 
-@compiled(GRAY, VECTOR, CUBE, CUBE, INT, INT)
+@compiled(GRAY, VECTOR, CUBE, CUBE, INT, INT, INT)
 def _profiles(
-    gray: NDArray[np.uint8], of_gray: Array, predicted_px: Array, normal: Array, edge: int, half: int
+    gray: NDArray[np.uint8], of_gray: Array, predicted_px: Array, normal: Array, edge: int, half: int, rows: int
 ) -> Array:
-    """Return the light (2 half + 1, M) every ``STEP_PX`` across the points of an edge.
+    """Return the light (2 half + 1, M) every ``STEP_PX`` across the points of an edge, each the mean of ``rows``.
 
     Continued beyond the image as at its border; zeros where a warp gone astray predicts no place at all.
     """
     points = predicted_px.shape[2]
-    profiles = np.empty((2 * half + 1, points))
-    for k in range(2 * half + 1):
-        away_px = (k - half) * STEP_PX
-        for m in range(points):
-            x = predicted_px[0, edge, m] + away_px * normal[0, edge, m]
-            y = predicted_px[1, edge, m] + away_px * normal[1, edge, m]
-            profiles[k, m] = light_between(gray, of_gray, x, y)
+    profiles = np.zeros((2 * half + 1, points))
+    for row in range(rows):
+        aside_px = (row - (rows - 1) / 2) * ROW_PX
+        for k in range(2 * half + 1):
+            away_px = (k - half) * STEP_PX
+            for m in range(points):
+                nx, ny = normal[0, edge, m], normal[1, edge, m]
+                x = predicted_px[0, edge, m] + away_px * nx - aside_px * ny
+                y = predicted_px[1, edge, m] + away_px * ny + aside_px * nx
+                profiles[k, m] += light_between(gray, of_gray, x, y) / rows
     for m in range(points):
         if not (abs(predicted_px[0, edge, m]) < FAR_PX and abs(predicted_px[1, edge, m]) < FAR_PX):
             profiles[:, m] = 0.0
@@ -285,7 +299,7 @@ def _judged(
     return found, alone, STEP_PX / np.sqrt(-np.log(ratio)), clipped_px
 
 
-@compiled(GRAY, VECTOR, CUBE, CUBE, VECTOR, FLAGS, REAL, REAL)
+@compiled(GRAY, VECTOR, CUBE, CUBE, VECTOR, FLAGS, INDICES, REAL, REAL)
 def _seen(
     gray: NDArray[np.uint8],
     of_gray: Array,
@@ -293,6 +307,7 @@ def _seen(
     normal: Array,
     reach_px: Array,
     facing: Mask,
+    rows: NDArray[np.int64],
     search_px: float,
     smoothing_px: float,
 ) -> tuple[Array, Mask, Mask, Mask, float, Array]:
@@ -307,7 +322,7 @@ def _seen(
     for e in range(edges):
         limit_px = WITHIN_REACH * reach_px[e]
         kept = int(((limit_px if limit_px < within_px else within_px) + 1e-9) / STEP_PX)
-        profiles = _profiles(gray, of_gray, predicted_px, normal, e, half)
+        profiles = _profiles(gray, of_gray, predicted_px, normal, e, half, rows[e])
         ink[e], paper[e] = _extremes(profiles)
         offset_px[e], rise[e], beside[e] = _steepest_rise(_slopes(profiles, weights, kept + 1))
     found, alone, blur_px, clipped_px = _judged(ink, paper, offset_px, rise, beside, in_view, reach_px)
@@ -316,6 +331,36 @@ def _seen(
             if not found[e, m]:
                 offset_px[e, m] = 0.0
     return offset_px, found, in_view, alone, blur_px, clipped_px
+
+
+@compiled(VECTOR, VECTOR, REAL)
+def _rows(length_px: Array, reach_px: Array, search_px: float) -> NDArray[np.int64]:
+    """Return in how many rows (E,) points of edges (E,) are looked at."""
+    rows = np.ones(len(length_px), np.int64)
+    for e in range(len(length_px)):
+        if search_px <= ROWS_WITHIN_PX and reach_px[e] >= ROWS_REACH_PX:
+            apart_px = length_px[e] / (ALONG_SHARE * POINTS_PER_EDGE)
+            rows[e] = min(max(int(apart_px / ROW_PX), 1), MOST_ROWS)
+    return rows
+
+
+@compiled(CUBE, CUBE, VECTOR, FLAG_MATRIX, INTO_MATRIX)
+def _straighten(predicted_px: Array, normal: Array, beside_px: Array, found: Mask, offset_px: Array) -> None:
+    """Take off the offsets (E, M) found how far blur along curved edges moves them to the inside of the curve."""
+    _, edges, points = predicted_px.shape
+    for e in range(edges):
+        for m in range(points):
+            if found[e, m]:
+                k, bend, squared_px = min(max(m, 1), points - 2), 0.0, 1e-9
+                for axis in range(2):
+                    before, at, after = (
+                        predicted_px[axis, e, k - 1],
+                        predicted_px[axis, e, k],
+                        predicted_px[axis, e, k + 1],
+                    )
+                    bend += normal[axis, e, k] * (before - 2 * at + after)
+                    squared_px += (after - before) ** 2 / 4
+                offset_px[e, m] -= beside_px[e] ** 2 / 2 * bend / squared_px
 
 
 @compiled(GRAY, VECTOR, CUBE, FLAGS, VECTOR, VECTOR, VECTOR, VECTOR, REAL)
@@ -339,10 +384,13 @@ def locate(
     """
     lie = _lie(seen_px, to_paper, reach, spacing, outside)
     predicted, normal, reach_px = lie[0], lie[1], lie[7]
-    seen = _seen(gray, of_gray, predicted, normal, reach_px, facing, search_px, SMOOTHING_PX)
-    lens_px = np.sqrt(seen[4] ** 2 - SMOOTHING_PX**2)
+    rows = _rows(lie[2], reach_px, search_px)
+    seen = _seen(gray, of_gray, predicted, normal, reach_px, facing, rows, search_px, SMOOTHING_PX)
+    smoothing_px, lens_px = SMOOTHING_PX, np.sqrt(seen[4] ** 2 - SMOOTHING_PX**2)
     wider_px = min(SMOOTHING_OF_LENS * lens_px, reach_px.max() / REACH_OF_SMOOTHING)
     if wider_px >= WORTHWHILE * SMOOTHING_PX:
-        wider_px = round(wider_px / SMOOTHING_STEP_PX) * SMOOTHING_STEP_PX
-        seen = _seen(gray, of_gray, predicted, normal, reach_px, facing, search_px, wider_px)
-    return Edges(*lie, *seen)
+        smoothing_px = round(wider_px / SMOOTHING_STEP_PX) * SMOOTHING_STEP_PX
+        seen = _seen(gray, of_gray, predicted, normal, reach_px, facing, rows, search_px, smoothing_px)
+    beside_px = np.sqrt(max(seen[4] ** 2 - smoothing_px**2, LEAST_LENS_PX**2) + ROW_PX**2 * (rows**2 - 1) / 12)
+    _straighten(predicted, normal, beside_px, seen[1], seen[0])
+    return Edges(*lie, *seen, rows, beside_px)

@@ -1,14 +1,13 @@
 """What lies beside the edges in the print of a known code.
 
-Across each sampling point of each edge runs a line over the print, as a profile does over the picture.  Where the line
-crosses other edges, and what changes there, is known from the template and the code.
+Across each sampling point of each edge runs a line over the print, as a profile does over the picture.  Where it
+crosses or passes other edges, and what changes there, is known from the template and the code.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cache, lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,19 +17,23 @@ from astratag.edges import EDGE_DIRECTION, EDGE_POINTS, EDGE_REACH, EDGES, INK_T
 from astratag.geometry import CELLS, DRAWN_OFFSET, LAYERS, cell_polygons, layer_points
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
+Numbers = NDArray[np.int64]
 
 PAPER, INK = CELLS, CELLS + 1
 """Labels of what is no cell."""
 HORIZON = 4.5
-"""Crossings further away than this many times an edge's reach do not matter: nearer ones spoil it first."""
-MOST_CROSSINGS = 6
+"""Edges further away than this many times an edge's reach do not matter: nearer ones spoil it first."""
 LEAN_STEP, LEANS = 0.5, np.linspace(-2.5, 2.5, 11)
-"""How lines lean for which crossings are listed; what others cross is taken to be as straight as beside the nearest."""
+"""How lines lean for which is listed what is beside them; what others pass is as straight as beside the nearest."""
 LEAST_TURNED = 0.02
 """Sine of the angle to a line at which an edge is not crossed but followed."""
 BESIDE_UNITS = 0.02
-"""How far before and after a crossing to look at what is there."""
-FAR = 1e6
+"""How far to either side of an edge to look at what is there."""
+SAME_UNITS = 1e-3
+DISTANCE, SKEW, START, END, CLOSENESS = range(5)
+PLACE = 5
+"""What of ``Crossings.places`` is where, and how much that is."""
 CELLS_OF_LAYERS = np.stack([layer_points(cell_polygons() + DRAWN_OFFSET, layer) for layer in LAYERS])
 """The triangles (3, 48, 3, 2) of all layers, template units."""
 SIDES_OF_LAYERS = np.array([(*(layer.frame or layer.black), *layer.black) for layer in LAYERS], dtype=float)
@@ -38,95 +41,99 @@ SIDES_OF_LAYERS = np.array([(*(layer.frame or layer.black), *layer.black) for la
 
 
 class Crossings(NamedTuple):
-    """Other edges on the lines across E edges' M points: K each, those that are not there with ``jump`` 0.
+    """The edges, its own among them, that a line across a point of one of E edges crosses or passes, K at most.
 
     What is square to an edge in the picture leans in the print when it is seen at a slant: by ``LEANS`` (S,), template
-    units along the edge for each across it, towards the paper.  All are (S E, M, K): ``distance`` template units across
-    the edge; ``jump`` the change of brightness there, in units of the edge's own; ``skew`` how the other edge's normal
-    lies, its part along the edge over its part along the line.
+    units along the edge for each across it, towards the paper.  For each lean, edge and point, nearest first, the
+    ``places`` (S E, M, K, ``PLACE``), template units: the ``DISTANCE`` across the edge at which the line crosses the
+    other, or would if that were longer; the ``SKEW`` of its normal, the part along the edge over the part along the
+    line; where it starts and ends (``START``, ``END``), along the edge from the line; its ``CLOSENESS`` to the point.
+    ``which`` (S E, M, K) is its number, from 1 on, in ``jump``: how much brighter it becomes there, in units of the
+    edge's own.  A negative one is crossed the other way, and 0 is none.
     """
 
-    distance: Array
+    places: Single
+    which: Numbers
     jump: Array
-    skew: Array
 
 
 @lru_cache(maxsize=128)
 def crossings(code: bytes) -> Crossings:
-    """Return the crossings that change the brightness in a print whose 48 bits are ``code``."""
+    """Return the crossings in a print whose 48 bits are ``code``."""
     bright = np.append(np.frombuffer(code, dtype=np.uint8).astype(float), (1.0, 0.0))  # cells, paper, ink
-    distance, skew, before, after = all_crossings()
-    jump = np.where(np.isfinite(distance), bright[after] - bright[before], 0.0)
-    nearest = np.argsort(np.where(jump != 0, np.abs(distance), np.inf), axis=2, kind="stable")[..., :MOST_CROSSINGS]
-    d, j, k = (np.ascontiguousarray(np.take_along_axis(part, nearest, axis=2)) for part in (distance, jump, skew))
-    return Crossings(np.where(j != 0, d, FAR), j, k)
+    _, _, left, right = _segments()
+    return Crossings(*all_crossings(), np.append(0.0, bright[left] - bright[right]))
 
 
-UNKNOWN = Crossings(*np.zeros((3, 0, POINTS_PER_EDGE, MOST_CROSSINGS)))
+UNKNOWN = Crossings(
+    np.zeros((0, POINTS_PER_EDGE, 0, PLACE), dtype=np.float32),
+    np.zeros((0, POINTS_PER_EDGE, 0), dtype=np.int64),
+    np.zeros(1),
+)
 """Of a print whose code is not known: none."""
 
 
 @cache
-def all_crossings() -> tuple[Array, Array, NDArray[np.int64], NDArray[np.int64]]:
-    """Return distances, skews and the labels before and after of all crossings (S E, M, many); distance inf is none.
+def all_crossings() -> tuple[Single, Numbers]:
+    """Return ``places`` and ``which`` of ``Crossings``, the same for all codes.  That takes 0.1 s, once."""
+    listed = [_crossings_of(float(lean)) for lean in LEANS]
+    row = np.concatenate([lines + n * EDGE_POINTS.size // 2 for n, (lines, _, _) in enumerate(listed)])
+    places, numbers = (np.concatenate(parts) for parts in list(zip(*listed, strict=True))[1:])
+    order = np.lexsort((places[:, CLOSENESS], row))
+    counts = np.bincount(row, minlength=len(LEANS) * EDGE_POINTS.size // 2)
+    rank = np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
+    shape = (len(LEANS) * len(EDGES), POINTS_PER_EDGE, counts.max())
+    at_places, which = np.zeros((*shape, PLACE), dtype=np.float32), np.zeros(shape, dtype=np.int64)
+    at_places.reshape(-1, shape[2], PLACE)[row[order], rank] = places[order]
+    which.reshape(-1, shape[2])[row[order], rank] = numbers[order]
+    return at_places, which
 
-    That takes 0.1 s, once.
+
+def _crossings_of(lean: float) -> tuple[Numbers, Array, Numbers]:
+    """Return what lines that lean by so much cross or pass, N in all: the lines' numbers, places (N, 5) and which."""
+    starts, ends, _, _ = _segments()
+    (u, v), (u_end, v_end) = (_along_and_across(points, lean) for points in (starts, ends))
+    near = (np.minimum(np.abs(v), np.abs(v_end)) < HORIZON * EDGE_REACH[:, None, None]) | (v * v_end < 0)
+    edge, point, number = np.nonzero(near)
+    u, v, u_end, v_end = u[near], v[near], u_end[near], v_end[near]
+    du, dv = u_end - u, v_end - v
+    length = np.hypot(du, dv)
+    part = np.clip(-(u * du + v * dv) / length**2, 0, 1)
+    closeness = np.hypot(u + part * du, v + part * dv)
+    listed = (np.abs(du) > LEAST_TURNED * length) & (closeness < HORIZON * EDGE_REACH[edge])
+    slope = dv[listed] / du[listed]
+    handed = EDGE_DIRECTION[:, 0] * INK_TO_PAPER[:, 1] - EDGE_DIRECTION[:, 1] * INK_TO_PAPER[:, 0]
+    which = (number + 1) * np.sign(du * handed[edge]).astype(np.int64)
+    begin, finish = np.minimum(u, u_end)[listed], np.maximum(u, u_end)[listed]
+    places = np.stack([v[listed] - u[listed] * slope, -slope, begin, finish, closeness[listed]], axis=1)
+    return (edge * POINTS_PER_EDGE + point)[listed], places, which[listed]
+
+
+def _along_and_across(places: Array, lean: float) -> tuple[Array, Array]:
+    """Return where places (S, 2) lie from edges' points (E, M, S): along the edge, and along the leaning line."""
+    along, across = (
+        (axis @ places.T)[:, None, :] - (axis[:, None, :] * EDGE_POINTS).sum(axis=2)[:, :, None]
+        for axis in (EDGE_DIRECTION, INK_TO_PAPER)
+    )
+    return along - lean * across, across
+
+
+@cache
+def _segments() -> tuple[Array, Array, Numbers, Numbers]:
+    """Return start and end (S, 2) of all straight edges of the print, each once, and the labels to their two sides.
+
+    First to the side to which the normal turns from the direction as the y axis does from the x axis.
     """
-    distance, skew, before, after = zip(*(_crossings_of(float(lean)) for lean in LEANS), strict=True)
-    most = max(part.shape[2] for part in distance)
-    return (
-        _joined(distance, most, np.inf),
-        _joined(skew, most, 0),
-        _joined(before, most, INK),
-        _joined(after, most, INK),
-    )
-
-
-def _joined(parts: Sequence[NDArray[Any]], most: int, fill: float) -> NDArray[Any]:
-    """Return arrays (E, M, up to most) one after another (S E, M, most)."""
-    return np.concatenate(
-        [np.pad(part, ((0, 0), (0, 0), (0, most - part.shape[2])), constant_values=fill) for part in parts]
-    )
-
-
-def _crossings_of(lean: float) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.int64]]:
-    """Return distances, skews and the labels (E, M, many) of the crossings on lines that lean by so much."""
-    starts, ends = _segments()
-    side = ends - starts
-    across = INK_TO_PAPER[:, None, None, :]  # (E, 1, 1, 2)
-    along = EDGE_DIRECTION[:, None, None, :]
-    line = across + lean * along
-    away = starts - EDGE_POINTS[:, :, None, :]
-    turned = line[..., 0] * side[:, 1] - line[..., 1] * side[:, 0]
-    slanted = np.where(np.abs(turned) > LEAST_TURNED * np.hypot(*side.T), turned, np.inf)
-    distance = (away[..., 0] * side[:, 1] - away[..., 1] * side[:, 0]) / slanted
-    where = (away[..., 0] * line[..., 1] - away[..., 1] * line[..., 0]) / slanted
-    horizon = HORIZON * EDGE_REACH[:, None, None]
-    met = (where >= 0) & (where <= 1) & (np.abs(distance) > 1e-6) & (np.abs(distance) < horizon) & (slanted != np.inf)
-    distance = np.where(met, distance, np.inf)
-    order = np.argsort(distance, axis=2)[..., : met.sum(axis=2).max()]
-    distance = np.take_along_axis(distance, order, axis=2)
-    finite = np.where(np.isfinite(distance), distance, FAR)
-    again = np.diff(finite, axis=2, prepend=-FAR) < BESIDE_UNITS  # edges that triangles share
-    distance = np.where(again, np.inf, distance)
-    handed = along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0]
-    skew = handed * (side[:, 0] * across[..., 0] + side[:, 1] * across[..., 1]) / slanted
-    skew = np.take_along_axis(np.broadcast_to(skew, away.shape[:3]), order, axis=2)
-    there = np.isfinite(distance)
-    edge, point, _ = np.nonzero(there)
-    before, after = np.full((2, *distance.shape), INK)
-    for labels, by in ((before, -BESIDE_UNITS), (after, BESIDE_UNITS)):
-        places = EDGE_POINTS[edge, point] + (distance[there] + by)[:, None] * line[edge, 0, 0]
-        labels[there] = _label(places, SIDES_OF_LAYERS, CELLS_OF_LAYERS.reshape(len(LAYERS), CELLS, 6))
-    return distance, skew, before, after
-
-
-def _segments() -> tuple[Array, Array]:
-    """Return start and end (S, 2) of all straight edges of the print."""
-    triangles = CELLS_OF_LAYERS.reshape(-1, 3, 2)
-    ends = np.roll(triangles, -1, axis=1)
-    sides = [np.array([edge.start for edge in EDGES]), np.array([edge.end for edge in EDGES])]
-    return np.concatenate([sides[0], triangles.reshape(-1, 2)]), np.concatenate([sides[1], ends.reshape(-1, 2)])
+    corners = CELLS_OF_LAYERS.reshape(-1, 3, 2)
+    sides = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2, 2)
+    sides = np.concatenate([[(edge.start, edge.end) for edge in EDGES], sides])
+    once = {frozenset(map(tuple, np.round(side / SAME_UNITS).astype(int).tolist())): side for side in sides[::-1]}
+    starts, ends = np.stack(list(once.values())[::-1], axis=1)
+    ahead = (ends - starts) / np.linalg.norm(ends - starts, axis=1, keepdims=True)
+    beside = BESIDE_UNITS * np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+    cells = CELLS_OF_LAYERS.reshape(len(LAYERS), CELLS, 6)
+    left, right = (_label((starts + ends) / 2 + away, SIDES_OF_LAYERS, cells) for away in (beside, -beside))
+    return starts, ends, left, right
 
 
 @compiled(MATRIX, MATRIX, CUBE)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from astratag.backdrop import FAR_MARGIN, OUTERMOST, THIN_MARGIN
 from astratag.bells import narrowing, pull
-from astratag.compiled import CUBE, FLAG_MATRIX, INDICES, MATRIX, REAL, VECTOR, compiled
+from astratag.compiled import BELLS, FLAG_MATRIX, INDICES, MATRIX, REAL, VECTOR, compiled
 from astratag.edges import POINTS_PER_EDGE
 
 Array = NDArray[np.float64]
@@ -19,9 +19,9 @@ SHARP_REACH_PX = 4.0
 """An edge this far from its neighbours is sharp; nearer, they pull."""
 PULL_PX, PULL_FLOOR_PX = 0.023, 0.0005
 """How far a whole edge may be off when its neighbours are as near as ``SHARP_REACH_PX``, and at least."""
-PULL_REST, SHORT_PX2, PULL_GROWTH = 0.08, 0.25, 2.0
-"""How wrong a pull is that is known, as a fraction of it; how far a whole edge is off besides, times the length it is
-seen at, for what is beside it is not much longer; how much faster than a weak pull a strong one grows with blur."""
+PULL_REST, PULL_GROWTH = 0.04, 2.0
+"""How wrong a pull is that is known, as a fraction of it; how much faster than a weak one a strong one grows with blur.
+"""
 BACKGROUND = 0.12
 """How far off the brightness of what is behind the print may be, over how much darker than paper ink is."""
 FAR_REACH = 4.0
@@ -60,7 +60,7 @@ def _unknown(reach_px: Array, clipped_px: Array) -> Pulls:
     return Pulls(none, variance, np.ones(clipped_px.shape), none, np.zeros(clipped_px.shape, np.bool_))
 
 
-@compiled(CUBE, VECTOR, FLAG_MATRIX, REAL)
+@compiled(BELLS, VECTOR, FLAG_MATRIX, REAL)
 def _blur_alone(beside: Array, reach_px: Array, alone: Mask, seen_px: float) -> float:
     """Return the blur that edges would show without neighbours, which narrow or widen them to what is ``seen_px``."""
     nearest_px, points = np.inf, 0
@@ -83,13 +83,12 @@ def _blur_alone(beside: Array, reach_px: Array, alone: Mask, seen_px: float) -> 
     return blur_px
 
 
-@compiled(MATRIX, MATRIX, REAL, INDICES, VECTOR, MATRIX, MATRIX)
+@compiled(MATRIX, MATRIX, REAL, INDICES, MATRIX, MATRIX)
 def _known(
     pull_px: Array,
     keen: Array,
     blur_px: float,
     edges: NDArray[np.int64],
-    length_px: Array,
     margin_px: Array,
     clipped_px: Array,
 ) -> Pulls:
@@ -102,7 +101,7 @@ def _known(
             if size_px <= MOST_PULL * blur_px:
                 believed[e, m] = pull_px[e, m]
                 growth[e, m] = pull_px[e, m] * (1 + PULL_GROWTH / blur_px * size_px)
-                wrong_px2 = (PULL_REST * size_px) ** 2 + (PULL_FLOOR_PX + SHORT_PX2 / max(length_px[e], 1.0)) ** 2
+                wrong_px2 = (PULL_REST * size_px) ** 2 + PULL_FLOOR_PX**2
                 margin = margin_px[e, m] / blur_px
                 if edges[e] < OUTERMOST and margin < FAR_MARGIN:
                     margin = max(margin, THIN_MARGIN)
@@ -123,11 +122,10 @@ def within_reach(reach_px: Array, blur_px: float, points: Mask) -> Mask:
     return pulled
 
 
-@compiled(CUBE, INDICES, VECTOR, VECTOR, MATRIX, MATRIX, MATRIX, FLAG_MATRIX, FLAG_MATRIX, REAL)
+@compiled(BELLS, INDICES, VECTOR, MATRIX, MATRIX, MATRIX, FLAG_MATRIX, FLAG_MATRIX, REAL)
 def pulls_on(
     beside: Array,
     edges: NDArray[np.int64],
-    length_px: Array,
     reach_px: Array,
     margin_px: Array,
     clipped_px: Array,
@@ -145,4 +143,4 @@ def pulls_on(
         return _unknown(reach_px, clipped_px)
     blur_px = _blur_alone(beside, reach_px, alone, blur_px)
     found = pull(beside, blur_px, within_reach(reach_px, blur_px, use), offset_px)
-    return _known(found.px, found.curvature, blur_px, edges, length_px, margin_px, clipped_px)
+    return _known(found.px, found.curvature, blur_px, edges, margin_px, clipped_px)

@@ -25,7 +25,7 @@ STEP_PX = 1.0
 """How far one step may take a point of the print, as a standard deviation."""
 LEAST_REACH_PX = 1e-12
 """By how much a parameter moves the print at least."""
-INTERPOLATED = 1.3
+INTERPOLATED = 1.0
 """Variance of a pixel's noise over that of residuals: 9/4 for values interpolated between pixels, less for what is left
 because looks are not exact.  In between, chosen so that neither poses of small markers nor
 corners of the smallest are claimed too exactly."""

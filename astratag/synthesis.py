@@ -12,27 +12,29 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, lru_cache
+from functools import lru_cache
 from typing import Generic, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from astratag.compiled import CUBE, FLAGS, GRAY, INT, MATRIX, REAL, VECTOR, compiled
+from astratag.compiled import CUBE, GRAY, MATRIX, VECTOR, compiled
 from astratag.dictionary import Dictionary
 from astratag.geometry import (
     CELLS,
     DRAWN_OFFSET,
     LAYERS,
     QUIET_MARGIN,
+    SQUARES,
     TEMPLATE_UNITS,
     cell_polygons,
     layer_points,
     square,
 )
+from astratag.grid import LAYER_REACH, MOST_AT_A_GLANCE, MOST_LINES, Look, look, widest_px
 from astratag.looks import AROUND, BY_BLUR, BY_X, BY_Y, MEAN, OUTSIDE, looks
-from astratag.normal import left_over, ranked
+from astratag.normal import left_over
 from astratag.steps import contrast, step, values
 from astratag.warp import FittedWarp
 
@@ -53,17 +55,8 @@ NODES, MANY_NODES = 24, 64
 """Points that stand for the Gaussian a pixel sees through: of a picture blurred beforehand, and of a sharp one."""
 WIDE = 1.8
 """Where, at a slant, what is left of the blur is so many times the picture's softness one way, two rings are coarse."""
-SOFTNESS = tuple(4.0 * 2 ** (k / 2) for k in range(10))
-"""Blurs of pictures that are kept, template units, and"""
-SOFT_SHARE = 0.85
-"""how much of the blur where it is least they may be: the rest is summed over nodes."""
 TEXELS = 4.0
 """Texels to a picture's blur."""
-REACH, LAYER_REACH = 0.07, 0.13
-"""How far beyond the black square the print is looked at, as a fraction of its side; and to tell layers apart by."""
-SPACING_PX = 0.8
-MOST_LINES, MOST_AT_A_GLANCE, FEWEST_LINES = 32, 20, 12
-"""Grid lines across the print: so many that they are ``SPACING_PX`` apart where it looks widest, within bounds."""
 SIGMA_FLOOR_PX = 0.006
 """What a point's standard deviation never falls below: print, lens model, shape of the blur."""
 FINELY_SAMPLED_PX, COARSENESS = 64.0, 1.5
@@ -72,12 +65,8 @@ SLANTING = 2 / 3
 """Prints seen at a slant are off by more than the floor: measured, by this power of how much smaller they look one way.
 A blur is not as round there as it is taken for."""
 LEAST_BLUR_PX, MOST_BLUR_PX = 0.5, 8.0
-HALF_UNIT = 0.5
-"""How far derivatives by place reach, template units."""
 STEPS, SETTLED_PX = 6, 0.02
 TINY = 1e-9
-FEWEST_POINTS = 60
-
 
 ASIDE = (1e-4, 2e-4)
 """How far from a texel's centre, this way and that by turns, it is looked what is there: on an edge through centres,
@@ -119,8 +108,6 @@ def _labels() -> NDArray[np.uint8]:
 
 
 _LABELS = _labels()
-_OUTER = square(0.0, TEMPLATE_UNITS)
-_OUTER.flags.writeable = False  # so that warps may keep where it is on a surface
 
 
 def _nodes(count: int) -> Array:
@@ -165,96 +152,6 @@ def _rings() -> Nodes:
 
 
 _FEW, _SPREAD = _rings(), _weighted(_nodes(NODES), np.full(NODES, 1 / NODES))
-
-
-@cache
-def _grid(lines: int, reach: float) -> tuple[Array, Array]:
-    """Return template points (lines^2, 2), and them and two neighbours half a unit on (3 lines^2, 2)."""
-    span = np.linspace(-reach, 1 + reach, lines) * TEMPLATE_UNITS
-    points = np.stack(np.meshgrid(span, span), axis=-1).reshape(-1, 2)
-    stencil = np.concatenate([points, points + (HALF_UNIT, 0.0), points + (0.0, HALF_UNIT)])
-    points.flags.writeable = stencil.flags.writeable = False  # so that warps may keep where they are on a surface
-    return points, stencil
-
-
-@dataclass(frozen=True, eq=False)
-class Look:
-    """Where and how a print is seen through one warp: N points of it in the image.
-
-    ``template`` (N, 2) and ``at_px`` (N, 2) are the points; ``to_template`` (N, 2, 2) takes pixels to template units
-    there; ``weight`` (N,) is how many pixels each stands for, at most one.
-    """
-
-    template: Array
-    at_px: Array
-    to_template: Array
-    weight: Array
-
-    @cached_property
-    def units(self) -> tuple[float, float]:
-        """Return the template units of a pixel the ways it has fewest and most: a tenth of points have fewer, more."""
-        return _units(self.to_template)
-
-    def softness(self, blur_px: float) -> float:
-        """Return the softest of ``SOFTNESS`` that a picture may have to be seen through a blur, 0 for a sharp one."""
-        limit = SOFT_SHARE * blur_px * self.units[0]
-        return max((softness for softness in SOFTNESS if softness <= limit), default=0.0)
-
-
-def _widest_px(warp: FittedWarp) -> float:
-    """Return how long the longest side of a print looks, at least a pixel."""
-    p0, p1, p2, p3 = warp(_OUTER).tolist()
-    return max(math.dist(p0, p1), math.dist(p1, p2), math.dist(p2, p3), math.dist(p3, p0), 1.0)
-
-
-@compiled(MATRIX, FLAGS, INT, INT, REAL)
-def _seen(stencil_px: Array, visible: Seen, height: int, width: int, spacing: float) -> Seeing:
-    """Return which of N points (N,) are seen in an image; and where, what takes pixels to template units, and weights.
-
-    ``stencil_px`` (3 N, 2) is where they are, and then their neighbours half a unit on; ``spacing`` the template units
-    between them.  Of the M that are seen come pixels (M, 2), matrices (M, 2, 2) and weights (M,).
-    """
-    count = len(visible)
-    use = np.zeros(count, dtype=np.bool_)
-    at_px, to_template, weight = np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count)
-    m = 0
-    for n in range(count):
-        x, y = stencil_px[n, 0], stencil_px[n, 1]
-        a, c = (stencil_px[count + n, 0] - x) / HALF_UNIT, (stencil_px[count + n, 1] - y) / HALF_UNIT
-        b, d = (stencil_px[2 * count + n, 0] - x) / HALF_UNIT, (stencil_px[2 * count + n, 1] - y) / HALF_UNIT
-        area = a * d - b * c
-        if visible[n] and area > 1e-9 and 1 <= x <= width - 2 and 1 <= y <= height - 2:
-            use[n] = True
-            at_px[m, 0], at_px[m, 1] = x, y
-            to_template[m, 0, 0], to_template[m, 0, 1] = d / area, -b / area
-            to_template[m, 1, 0], to_template[m, 1, 1] = -c / area, a / area
-            weight[m] = min(spacing**2 * area, 1.0)
-            m += 1
-    return use, at_px[:m], to_template[:m], weight[:m]
-
-
-@compiled(CUBE)
-def _units(to_template: Array) -> tuple[float, float]:
-    """Return the smaller singular value of matrices (N, 2, 2) that a tenth have less than, and the larger, more."""
-    count = len(to_template)
-    fewest, most = np.empty(count), np.empty(count)
-    for n in range(count):
-        a, b, c, d = to_template[n, 0, 0], to_template[n, 0, 1], to_template[n, 1, 0], to_template[n, 1, 1]
-        total, area = a * a + b * b + c * c + d * d, a * d - b * c
-        apart = math.sqrt(max(total * total - 4 * area * area, 0.0))
-        fewest[n], most[n] = math.sqrt(max(total - apart, 0.0) / 2), math.sqrt((total + apart) / 2)
-    return ranked(fewest, count // 10), ranked(most, count - 1 - count // 10)
-
-
-def look(warp: FittedWarp, shape: tuple[int, ...], reach: float = REACH, most_lines: int = MOST_LINES) -> Look | None:
-    """Return how a print and ``reach`` sides around it lie in an image of ``shape`` (H, W); None when hardly at all."""
-    lines = int(min(max(_widest_px(warp) * (1 + 2 * reach) / SPACING_PX, FEWEST_LINES), most_lines))
-    points, stencil = _grid(lines, reach)
-    spacing = TEMPLATE_UNITS * (1 + 2 * reach) / (lines - 1)
-    use, *seen = _seen(np.ascontiguousarray(warp(stencil)), warp.visible(points), shape[0], shape[1], spacing)
-    if len(seen[0]) < FEWEST_POINTS:
-        return None
-    return Look(points if len(seen[0]) == len(points) else points[use], *seen)
 
 
 class Picture(NamedTuple):
@@ -319,7 +216,7 @@ class Alignment(Generic[W]):
     @property
     def cautious_covariance(self) -> Array:
         """Return the covariance (P, P) enlarged so that the outer corners are known no better than ``sigma_px``."""
-        return (1 + self._floor_px() ** 2 / self._variance_px2(_OUTER)) * self.covariance
+        return (1 + self._floor_px() ** 2 / self._variance_px2(SQUARES[0])) * self.covariance
 
     def _variance_px2(self, template: Array) -> float:
         J = self.warp.jacobian(template)
@@ -327,7 +224,7 @@ class Alignment(Generic[W]):
 
     def _floor_px(self) -> float:
         """Return ``SIGMA_FLOOR_PX``, more where a print looks so large that its grid is coarse, or is slanted."""
-        coarse = max(1.0, _widest_px(self.warp) / FINELY_SAMPLED_PX) ** COARSENESS
+        coarse = max(1.0, widest_px(self.warp) / FINELY_SAMPLED_PX) ** COARSENESS
         return SIGMA_FLOOR_PX * coarse * self.slant**SLANTING
 
 
@@ -428,7 +325,7 @@ class Synthesis:
         """
         alignment = None
         for taken in range(steps):
-            seen = look(warp, light.shape)
+            seen = look(warp, light.shape, blur_px=blur_px)
             if seen is None:
                 return None
             shown = looks_of(seen, self._picture(marker_id, seen.softness(blur_px)), blur_px)

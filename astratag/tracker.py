@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,7 +132,8 @@ class Tracker:
             if fit is not None and fit.cost < COST_LIMIT:
                 detection = self.detector.describe(view, track.marker_id, fit, "tracked")
                 if detection is not None:
-                    return self.detector.polished(view, self._unmirrored(view, detection, fit), POLISHED_PX)
+                    surface = fit.warp.surface if isinstance(fit.warp, PoseWarp) else None
+                    return self.detector.polished(view, self._unmirrored(view, detection, fit), POLISHED_PX, surface)
         return self._match_near(view, track)
 
     def _unmirrored(self, view: View, detection: Detection, fit: Fit) -> Detection:
@@ -165,7 +166,7 @@ class Tracker:
         """Return the fit to ``edges`` around a predicted pose, to all when it moved far."""
         warp, near = self._predicted(view, marker_id, T_cam_marker), self.detector.near(marker_id)
         if isinstance(warp, HomographyWarp):
-            return grow(view.light, warp, 0, near)
+            return grow(view.light, warp, 0, near, partial(self.detector.pose_of_plane, view, marker_id))
         fit: Fit | None = fit_edges(view.light, warp, edges, search_px, near)
         return fit if fit is None or fit.moved_px < SETTLED_PX else settle(view.light, fit.warp, near)
 

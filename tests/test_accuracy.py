@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from astratag import Camera, Cylinder, Detector, Flat, Tracker, load_dictionary
+from astratag.fit import fit_edges
 from astratag.geometry import square
-from astratag.grow import settle
+from astratag.grow import ALL_EDGES, SETTLE_PX, settle
 from astratag.layers import measure_layers
 from astratag.surface import Surface
 from astratag.transforms import difference, exp_so3, perturb, pose
 from astratag.warp import PoseWarp
-from pipeline.render import develop, lay_print, light_behind
+from pipeline.render import render_marker
 
 MARKER_ID, SIDE_M = 7, 0.1
 SIGNATURE = load_dictionary().signature(MARKER_ID)
@@ -34,10 +35,20 @@ class Errors:
     pose_nees: float
 
 
-def photograph(T_cam_marker: np.ndarray, surface: Surface, seed: int, noise_sigma: float = 2.0) -> np.ndarray:
-    light = light_behind(CAMERA, 60)
-    light = lay_print(light, CAMERA, T_cam_marker, signature=SIGNATURE, side_m=SIDE_M, surface=surface)
-    return develop(light, blur_px=0.8, noise_sigma=noise_sigma, seed=seed)
+def photograph(
+    T_cam_marker: np.ndarray, surface: Surface, seed: int, noise_sigma: float = 2.0, samples: int = 8
+) -> np.ndarray:
+    return render_marker(
+        CAMERA,
+        T_cam_marker,
+        signature=SIGNATURE,
+        side_m=SIDE_M,
+        surface=surface,
+        noise_sigma=noise_sigma,
+        background=60,
+        seed=seed,
+        samples=samples,
+    )
 
 
 def measured(surface: Surface, side_px: float, tilt_deg: float, draws: int = 16) -> Errors:
@@ -92,3 +103,28 @@ def test_a_slow_approach_near_frontal_never_flips(tilt_rad: float) -> None:
         assert sum(planar.probability for planar in seen.planar_poses) == pytest.approx(1)
         turned.append(np.degrees(np.linalg.norm(difference(T_cam_marker, seen.T_cam_marker)[3:])))
     assert max(turned[3:]) < 4.0
+
+
+SLANTED = {
+    "flat, tilted": (Flat(), (1.0, 0.4), 75),
+    "cylinder, turned": (Cylinder(0.15, 0.0), (1.0, 0.0), 60),
+    "tight cylinder, tilted": (Cylinder(0.077, 0.0), (0.5, 1.0), 50),
+}
+
+
+@pytest.mark.parametrize("scene", SLANTED)
+def test_edges_are_where_the_true_pose_has_them(scene: str) -> None:
+    """At a slant neighbours pull, units grow along the edges as well as across, and curved edges move inwards."""
+    surface, about, tilt_deg = SLANTED[scene]
+    detector, means = Detector(side_m=SIDE_M, surface=surface), []
+    axis = np.radians(tilt_deg) * np.array([*about, 0.0]) / np.hypot(*about)
+    for roll_rad in (0.3, 1.1, 1.9, 2.6):
+        T_cam_marker = pose(FACING @ exp_so3([0, 0, roll_rad]) @ exp_so3(axis), [0.004, -0.003, 0.25])
+        image = photograph(T_cam_marker, surface, 0, noise_sigma=0.0, samples=64)
+        light, truth = detector.view(image, CAMERA).light, PoseWarp(CAMERA, SIDE_M, surface, T_cam_marker)
+        fit = fit_edges(light, truth, ALL_EDGES, SETTLE_PX, detector.near(MARKER_ID))
+        assert fit is not None
+        seen = fit.weight.sum(axis=1) > 0
+        means += list((fit.weight * fit.offset_px).sum(axis=1)[seen] / fit.weight.sum(axis=1)[seen])
+    assert len(means) > 40
+    assert np.median(np.abs(means)) < 0.004

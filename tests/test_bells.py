@@ -25,10 +25,10 @@ BLUR_PX = 1.15
 SEED = 11
 
 
-def beside(unit_px: float, lean: float = 0.0, squeeze: float = 1.0) -> Array:
-    """Return what is around all edges where they look alike."""
+def beside(unit_px: float, lean: float = 0.0, squeeze: float = 1.0, along_px: float = BLUR_PX) -> Array:
+    """Return what is around all edges where they look alike; ``along_px`` is what they are blurred by lengthwise."""
     look = (np.full(POINTS, value) for value in (unit_px, 0.0, lean, squeeze, 1e3))
-    return around(*NEAR, EVERY_EDGE, *look, NOTHING, EVERY_POINT)
+    return around(*NEAR, EVERY_EDGE, *look, NOTHING, BLUR_PX, np.full(len(EDGES), along_px), EVERY_POINT)
 
 
 def top_of_samples(slopes: Array) -> float:
@@ -38,26 +38,11 @@ def top_of_samples(slopes: Array) -> float:
     return STEP_PX * float(best - len(slopes) // 2 + 0.5 * (after - before) / (2 * top - before - after))
 
 
-@pytest.mark.parametrize("unit_px", [0.06, 0.1, 0.2])
-def test_the_pull_is_where_a_blurred_profile_is_steepest(unit_px: float) -> None:
-    """Where all crossings are square to the line, the profile is known in closed form."""
-    x, expected = np.arange(-3, 4) * STEP_PX, np.full(POINTS, np.nan)
-    upright = int(np.flatnonzero(LEANS == 0)[0]) * len(EDGES)
-    for edge in range(4):
-        for point in range(POINTS[1]):
-            distance, jump, skew = (part[upright + edge, point] for part in NEAR)
-            close = (np.abs(distance) / np.hypot(1, skew) * unit_px < 5 * BLUR_PX) & (jump != 0)
-            if np.abs(skew[close]).max(initial=0.0) < 0.04:
-                bells = [j * norm.pdf(x - d, scale=BLUR_PX) for d, j in zip(distance * unit_px, jump, strict=True)]
-                expected[edge, point] = top_of_samples(norm.pdf(x, scale=BLUR_PX) + np.sum(bells, axis=0))
-    found = pull(beside(unit_px), BLUR_PX, EVERY_POINT, np.nan_to_num(expected)).px
-    known = np.isfinite(expected) & np.isfinite(found)
-    assert known.sum() > 10
-    np.testing.assert_allclose(found[known], expected[known], atol=0.03 * BLUR_PX)
+def steepest(edge: int, point: int, px_of_unit: Array, along_px: float) -> float:
+    """Return where the blurred picture of a print seen through an affine map (2, 2) is steepest across an edge.
 
-
-def steepest(edge: int, point: int, px_of_unit: Array) -> float:
-    """Return where the blurred picture of a print seen through an affine map (2, 2) is steepest across an edge."""
+    It is blurred by ``BLUR_PX`` across the edge, and by ``along_px`` along it.
+    """
     tangent = px_of_unit @ EDGE_DIRECTION[edge]
     tangent /= np.linalg.norm(tangent)
     across = np.array([-tangent[1], tangent[0]])
@@ -67,7 +52,7 @@ def steepest(edge: int, point: int, px_of_unit: Array) -> float:
     units = EDGE_POINTS[edge, point] + places @ np.linalg.inv(px_of_unit).T
     texels = ((units + (PRINT_UNITS - TEMPLATE_UNITS) / 2) * TEXELS_PER_UNIT - 0.5).astype(np.float32)
     picture = cv2.remap(PRINT, texels[..., 0], texels[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    profile = picture @ norm.pdf(at, scale=BLUR_PX)
+    profile = picture @ norm.pdf(at, scale=along_px)
     x = np.arange(-3, 4) * STEP_PX
     weights = (at - x[:, None]) * norm.pdf(at - x[:, None], scale=BLUR_PX)
     return top_of_samples(weights @ profile)
@@ -76,31 +61,36 @@ def steepest(edge: int, point: int, px_of_unit: Array) -> float:
 PRINT = print_coverage(CODE).astype(np.float32)
 
 
+@pytest.mark.parametrize("along_px", [BLUR_PX, 0.85])
 @pytest.mark.parametrize("tilt_deg", [0, 60, 75, 80])
-def test_pulls_are_what_a_blurred_picture_of_the_print_shows(tilt_deg: float) -> None:
-    """Seen at a slant, what is square to an edge in the picture leans in the print, and edges cross at other angles."""
+def test_pulls_are_what_a_blurred_picture_of_the_print_shows(tilt_deg: float, along_px: float) -> None:
+    """Seen at a slant, what is square to an edge in the picture leans in the print, and edges cross at other angles.
+
+    They end, and the profile is blurred less along the edge than across it.
+    """
     rng = np.random.default_rng(SEED)
     pulls, errors = [], []
     for turn, azimuth in rng.uniform(0, 2 * np.pi, (6, 2)):
         turned, tilted = (np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]]) for a in (turn, azimuth))
         px_of_unit = 0.23 * turned @ tilted @ np.diag([1.0, np.cos(np.radians(tilt_deg))]) @ tilted.T
-        for edge in rng.choice(12, 4, replace=False).tolist():
+        for edge in rng.choice(len(EDGES), 7, replace=False).tolist():
             along, across = px_of_unit @ EDGE_DIRECTION[edge], px_of_unit @ INK_TO_PAPER[edge]
-            along_px = np.linalg.norm(along)
-            unit_px = abs(np.linalg.det(px_of_unit)) / along_px
-            lean = -float(along @ across) / along_px**2
+            units_along_px = float(np.linalg.norm(along))
+            unit_px = abs(np.linalg.det(px_of_unit)) / units_along_px
+            lean = -float(along @ across) / units_along_px**2
             if EDGES[edge].reach * unit_px < 1.6 * BLUR_PX or abs(lean) > LEANS[-1]:
                 continue
             chosen, seen_px = rng.choice(np.arange(4, POINTS[1] - 4), 3, replace=False).tolist(), np.zeros(POINTS)
             for point in chosen:
-                seen_px[edge, point] = steepest(edge, point, px_of_unit)
-            found = pull(beside(unit_px, lean, unit_px / along_px), BLUR_PX, EVERY_POINT, seen_px).px
+                seen_px[edge, point] = steepest(edge, point, px_of_unit, along_px)
+            look = beside(unit_px, lean, unit_px / units_along_px, along_px)
+            found = pull(look, BLUR_PX, EVERY_POINT, seen_px).px
             errors += [
                 found[edge, point] - seen_px[edge, point] for point in chosen if not np.isnan(found[edge, point])
             ]
             pulls += [seen_px[edge, point] for point in chosen]
     assert len(errors) > 20
-    assert np.sqrt(np.mean(np.square(errors))) < 0.01 + 0.2 * np.sqrt(np.mean(np.square(pulls)))
+    assert np.sqrt(np.mean(np.square(errors))) < 0.1 * np.sqrt(np.mean(np.square(pulls)))
 
 
 def test_nothing_pulls_from_far_away() -> None:
@@ -115,7 +105,7 @@ def test_what_is_behind_a_thin_margin_pulls_like_an_edge() -> None:
     x = np.arange(-3, 4) * STEP_PX
     bar_px = top_of_samples(norm.pdf(x, scale=BLUR_PX) - norm.pdf(x - 2.5, scale=BLUR_PX))
     look = (np.full(POINTS, value) for value in (10.0, 0.0, 0.0, 1.0, 2.5))
-    dark = around(*NEAR, EVERY_EDGE, *look, np.full(POINTS, -1.0), EVERY_POINT)
+    dark = around(*NEAR, EVERY_EDGE, *look, np.full(POINTS, -1.0), BLUR_PX, np.full(len(EDGES), BLUR_PX), EVERY_POINT)
     found = pull(dark, BLUR_PX, EVERY_POINT, np.full(POINTS, bar_px))
     assert bar_px < -0.05
     np.testing.assert_allclose(found.px[:4], bar_px, atol=0.01)
@@ -123,4 +113,4 @@ def test_what_is_behind_a_thin_margin_pulls_like_an_edge() -> None:
 
 def test_what_is_around_a_print_of_unknown_code_is_not_known() -> None:
     look = (np.full(POINTS, value) for value in (1.0, 0.0, 0.0, 1.0, 1e3))
-    assert len(around(*UNKNOWN, EVERY_EDGE, *look, NOTHING, EVERY_POINT)) == 0
+    assert len(around(*UNKNOWN, EVERY_EDGE, *look, NOTHING, BLUR_PX, np.full(len(EDGES), BLUR_PX), EVERY_POINT)) == 0

@@ -64,6 +64,7 @@ def test_covariances_of_a_cell_are_looked_at_beside_their_band(tmp_path):
         assert row["poses"] == 2 and row["other_pose"] == 0
         assert row["nees_95"] == pytest.approx(band(2))
         assert 0 < row["nees"] < 5
+        assert row["bounded"] == 1 and 0.5 < row["times_bound"] < 50
     assert draw_covariance(rows, tmp_path).stat().st_size > 0
 
 

@@ -11,8 +11,9 @@ import pytest
 from astratag import Camera, Cylinder, Detector, Flat, Surface, Tracker, load_dictionary
 from astratag.edges import inverse_transfer
 from astratag.geometry import QUIET_MARGIN, TEMPLATE_UNITS, square
+from astratag.grid import look
 from astratag.matching import HOPELESS, Match, acceptance_of_pixels, match, rough_matches
-from astratag.synthesis import Expected, Synthesis, _nodes, _picture, _weighted, expected, look
+from astratag.synthesis import Expected, Synthesis, _nodes, _picture, _weighted, expected
 from astratag.transforms import difference, exp_so3, perturb, pose
 from astratag.warp import FittedWarp, HomographyWarp, PoseWarp
 from pipeline.render import render_marker

@@ -106,18 +106,19 @@ def cell_text(row: dict) -> str:
 
 
 def show_covariance(rows: Sequence[dict]) -> None:
-    """Print the mean NEES of each cell beside its band, and how often the other planar pose was the right one."""
+    """Print the mean NEES of each cell beside its band, how often the other planar pose was right, and errors' size."""
     title = (
         f"NEES a degree of freedom, ! outside its {CONFIDENCE:.0%} band (other planar pose right, of so many expected)"
     )
     table = Table(title=title, title_justify="left", box=None)
-    for heading in ("", "", *(f"surface {surface}" for surface in SURFACES), "band"):
+    for heading in ("", "", *(f"surface {surface}" for surface in SURFACES), "band", "error / bound"):
         table.add_column(heading)
     for name, values in CELLS.items():
         for value in values:
             mine = [row for row in rows if (row["condition"], row["value"]) == (name, value)]
             low, high = mine[0]["nees_95"]
-            table.add_row(name, f"{value:g}", *(nees_text(row) for row in mine), f"{low:.2f} to {high:.2f}")
+            band, bound = f"{low:.2f} to {high:.2f}", f"{mine[0]['times_bound']:.1f}"
+            table.add_row(name, f"{value:g}", *(nees_text(row) for row in mine), band, bound)
     CONSOLE.print(table)
     CONSOLE.print(f"first seeds: {', '.join(str(row['first_seed']) for row in rows[:: len(SURFACES)])}\n", style="dim")
 

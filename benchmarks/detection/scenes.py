@@ -19,7 +19,17 @@ from numpy.typing import NDArray
 from astratag import Camera, Cylinder, Flat, Surface
 from astratag.geometry import QUIET_MARGIN
 from astratag.transforms import exp_so3, pose, transform
-from pipeline.render import BLACK_ALBEDO, WHITE_ALBEDO, develop, lay_texture, light_behind, linear_from_srgb
+from pipeline.render import (
+    BLACK_ALBEDO,
+    FINER,
+    WHITE_ALBEDO,
+    develop,
+    encoded,
+    finer_camera,
+    lay_texture,
+    light_behind,
+    linear_from_srgb,
+)
 from pipeline.texture import Image, Texture
 
 Array = NDArray[np.float64]
@@ -86,20 +96,34 @@ class Draw:
     surface: Surface
     seed: int
 
-    def photograph(self, texture: Texture, rays: int = 8) -> NDArray[np.uint8]:
+    def photograph(self, texture: Texture, rays: int = 16) -> NDArray[np.uint8]:
         """Return the gray picture with a print in it, of so many rays a pixel."""
+        light, blur_px, noise_sigma = self._light(texture, rays), self.scene.blur_px, self.scene.noise_sigma
+        return develop(light, blur_px=blur_px, noise_sigma=noise_sigma, seed=self.seed, finer=FINER)
+
+    def expected(self, texture: Texture, rays: int = 16) -> Image:
+        """Return that picture before noise and rounding, in grey levels."""
+        return encoded(self._light(texture, rays), blur_px=self.scene.blur_px, finer=FINER)
+
+    def _light(self, texture: Texture, rays: int) -> Image:
+        """Return the light of the scene at ``FINER`` times the picture's resolution."""
         background = textured(self.scene.width_px, self.scene.height_px, self.seed % BACKGROUNDS)
-        behind = light_behind(self.camera, background)
-        light = lay_texture(behind, self.camera, self.T_cam_print, texture, self.surface, rays)
+        fine = finer_camera(self.camera)
+        behind = cv2.resize(light_behind(self.camera, background), (fine.width, fine.height))
+        light = lay_texture(behind, fine, self.T_cam_print, texture, self.surface, rays // FINER**2)
         if self.scene.change is not None:
-            grid = self.pixels(np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, GRID)] * 2), axis=-1) * SHEET_M)
-            light = self.scene.change(light, grid, np.random.default_rng([self.seed, 1]))
-        return develop(light, blur_px=self.scene.blur_px, noise_sigma=self.scene.noise_sigma, seed=self.seed)
+            grid = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, GRID)] * 2), axis=-1) * SHEET_M
+            light = self.scene.change(light, self._seen(fine, grid), np.random.default_rng([self.seed, 1]))
+        return light
 
     def pixels(self, on_print: Array) -> Array:
         """Return where print points (..., 2), metres, x right and y up, are in the picture (..., 2)."""
+        return self._seen(self.camera, on_print)
+
+    def _seen(self, camera: Camera, on_print: Array) -> Array:
+        """Return where print points (..., 2) are in a camera's picture (..., 2)."""
         in_camera = transform(self.T_cam_print, self.surface.points(on_print).reshape(-1, 3))
-        return self.camera.project(in_camera).reshape(on_print.shape)
+        return camera.project(in_camera).reshape(on_print.shape)
 
 
 def draw(scene: Scene, seed: int) -> Draw:
