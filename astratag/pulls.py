@@ -20,7 +20,7 @@ SHARP_REACH_PX = 4.0
 PULL_PX, PULL_FLOOR_PX = 0.023, 0.0005
 """How far a whole edge may be off when its neighbours are as near as ``SHARP_REACH_PX``, and at least."""
 PULL_REST, PULL_GROWTH = 0.04, 2.0
-"""How wrong a pull is that is known, as a fraction of it (0.02 to 0.06 through an exact blur); how much faster than a
+"""How wrong a pull is that is known, as a fraction of it (0.03 to 0.06 through an exact blur); how much faster than a
 weak one a strong one grows with blur."""
 BACKGROUND = 0.12
 """How far off the brightness of what is behind the print may be, over how much darker than paper ink is."""
