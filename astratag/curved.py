@@ -56,6 +56,8 @@ PROMISING, MAX_CANDIDATES, MAX_READ, MAX_GLANCED_AT = 0.44, 4, 5, 200
 
 Of so many whose cells are glanced at, the likeliest: of 56 bent prints that were found, all were among the first 3.
 """
+MAX_PLACES = 3
+"""Of near sides that seem a print's, so many are looked at more closely."""
 SHARE_OF_LOOKS, AT_ONCE, WORTH_MOVING = 0.25, 0.69, 0.62
 """What the correlation of a bent square, and this share of how it looks, must come to for it to be moved at once, or at
 all.
@@ -170,12 +172,10 @@ def _near_sides(
 
 def curved_candidates(gray: Image, bent: Bent, codebook: Codebook, artwork: Artwork) -> list[Candidate]:
     """Return the bent squares that read and look something like a marker, the best about each place, the best first."""
-    at = bent.framed(gray, LEAST_FRAMED)[:MAX_GLANCED_AT]
+    at, facing = _glanced_at(gray, bent, codebook)
     if len(at) == 0:
         return []
-    middles_px, facing = bent.seen(CELL_MIDDLES, at)
-    likeliest = codebook.likeliest(_with_middle(sample(gray, middles_px), facing), MAX_READ)
-    at, facing = at[likeliest], facing[likeliest]
+    at, facing = at[:MAX_READ], facing[:MAX_READ]
     cells = _with_middle(cell_values(gray, bent.project(SAMPLES, at)), facing)
     corners_px = bent.project(OUTER, at)
     found: list[Candidate] = []
@@ -188,6 +188,20 @@ def curved_candidates(gray: Image, bent: Bent, codebook: Codebook, artwork: Artw
     found = [replace(candidate, promise=_promise(gray, candidate, artwork)) for candidate in found]
     worth = [candidate for candidate in found if candidate.promise >= WORTH_MOVING - AT_ONCE]
     return sorted(worth, key=lambda candidate: -candidate.promise)[:MAX_CANDIDATES]
+
+
+def likely_places(gray: Image, bent: Bent, codebook: Codebook) -> list[int]:
+    """Return the places, ``MAX_PLACES`` at most, of the bent squares that are most like a code at a glance."""
+    at, _ = _glanced_at(gray, bent, codebook)
+    return list(dict.fromkeys(at[:, 0].tolist()))[:MAX_PLACES]
+
+
+def _glanced_at(gray: Image, bent: Bent, codebook: Codebook) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the bent squares (N, 2) that have a frame, those most like a code first, and which cells face (N, 48)."""
+    at = bent.framed(gray, LEAST_FRAMED)[:MAX_GLANCED_AT]
+    middles_px, facing = bent.seen(CELL_MIDDLES, at)
+    likeliest = codebook.likeliest(_with_middle(sample(gray, middles_px), facing), len(at))
+    return at[likeliest], facing[likeliest]
 
 
 def _with_middle(cells: Array, facing: NDArray[np.bool_]) -> Array:

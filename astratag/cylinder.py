@@ -35,9 +35,12 @@ NEAREST = 1e-3
 """How near the camera, in sides, a point is taken to be that is nearer, or behind it."""
 HALF_ANGLES_RAD = (0.12, 0.3, 0.6)
 """How far a square may bend to either side of its middle: layers of radii 0.8 to 2 sides are near one of these."""
-TURNS_RAD = (1.13, 1.22, 1.31, 1.4)
-LEANS_RAD = (-0.2, 0.0, 0.2)
-"""How far a print of which only the near side is whole may be turned about it (65 to 80 degrees), and along it."""
+TURNS_RAD = (1.13, 1.175, 1.22, 1.265, 1.31, 1.355, 1.4)
+LEANS_RAD = (-0.2, -0.1, 0.0, 0.1, 0.2)
+"""How far a print of which only the near side is whole may be turned about it (65 to 80 degrees), and along it.
+
+Every other one will do to tell which sides are a print's.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,6 +212,11 @@ class Bent:
     """(Q, M, 3), t_cam_marker, sides."""
 
     @property
+    def count(self) -> int:
+        """Return how many there are."""
+        return self.translation.shape[0] * self.translation.shape[1]
+
+    @property
     def all(self) -> NDArray[np.int64]:
         """Return the place and model (Q M, 2) of each."""
         return np.argwhere(np.ones(self.translation.shape[:2], dtype=bool))
@@ -306,12 +314,12 @@ def bent_through(camera: Camera, quads: Array, half_angles_rad: tuple[float, ...
     return Bent(camera, curvature, axis_rad, *_through(seen, half_angles))
 
 
-def bent_beside(camera: Camera, sides: Array) -> Bent:
+def bent_beside(camera: Camera, sides: Array, *, coarse: bool = False) -> Bent:
     """Return bent squares whose tops, straight and whole, are seen at sides (Q, 2, 2), and whose bottoms turn away.
 
     The pose whose rotation is given takes two points to where they are seen: linear in its translation.
     """
-    half_angle, rotations, ends = _beside_models()
+    half_angle, rotations, ends = _beside_models(2 if coarse else 1)
     rays = camera.undistort(sides.reshape(-1, 2)).reshape(-1, 2, 2)
     (x, y), zero = (rays[:, 1] - rays[:, 0]).T, np.zeros(len(rays))
     c, s = x / np.hypot(x, y), y / np.hypot(x, y)
@@ -321,9 +329,9 @@ def bent_beside(camera: Camera, sides: Array) -> Bent:
 
 
 @cache
-def _beside_models() -> tuple[Array, Array, Array]:
+def _beside_models(step: int) -> tuple[Array, Array, Array]:
     """Return half-angles (M,), rotations (M, 3, 3) by turns and leans, and where the ends of the top are (M, 2, 3)."""
-    half_angle, turn, lean = np.array(list(product(HALF_ANGLES_RAD, TURNS_RAD, LEANS_RAD))).T
+    half_angle, turn, lean = np.array(list(product(HALF_ANGLES_RAD, TURNS_RAD[::step], LEANS_RAD[::step]))).T
     c, s, zero = np.cos(lean), np.sin(lean), np.zeros(len(lean))
     leant = _matrices([[c, zero, s], [zero, zero + 1, zero], [-s, zero, c]])
     c, s = np.cos(turn), np.sin(turn)

@@ -31,7 +31,7 @@ from astratag.checks import instance
 from astratag.codes.acceptance import FALSE_ACCEPT_RATE, chance_of_correlation
 from astratag.codes.soft import CREDIBLE
 from astratag.confirm import Confirmer
-from astratag.curved import LEAST_SIDE_PX, curved_candidates, near_sides
+from astratag.curved import LEAST_SIDE_PX, curved_candidates, likely_places, near_sides
 from astratag.cylinder import Bent, CylinderWarp, bent_beside, bent_through
 from astratag.describe import PIXEL_BLUR, MarkerSpec
 from astratag.detection import Detection
@@ -233,7 +233,12 @@ class Detector(Confirmer):
         found, outlines = self._search_bent(view, _outlines(view, THIN)), _outlines(view, NARROW)
         if found or not view.effort.spend(COST.near_pixel * outlines.followed):
             return found
-        return self._search_curved(view, bent_beside(view.some_camera, near_sides(outlines)))
+        sides = near_sides(outlines)
+        coarse = bent_beside(view.some_camera, sides, coarse=True)
+        if not view.effort.spend(COST.bent * coarse.count):
+            return []
+        likely = likely_places(view.gray, coarse, self._codebook)
+        return self._search_curved(view, bent_beside(view.some_camera, sides[likely]))
 
     def _search_by_spline(self, view: View) -> list[Detection]:
         """Return the markers on surfaces that no cylinder explains."""
@@ -246,7 +251,7 @@ class Detector(Confirmer):
 
     def _search_curved(self, view: View, bent: Bent) -> list[Detection]:
         """Return the markers among squares bent about cylinders."""
-        if not view.effort.spend(COST.bent * bent.translation[..., 0].size + COST.bent_read):
+        if not view.effort.spend(COST.bent * bent.count + COST.bent_read):
             return []
         return surest(self._confirm_all(view, curved_candidates(view.gray, bent, self._codebook, self._artwork)))
 

@@ -40,11 +40,22 @@ class Sensor:
         return float(np.hypot(self.blur_px, radius_px / 2))
 
     def expose(self, light: Image, camera: Camera, *, range_m: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-        """Return the picture (height, width, 3), sRGB, of linear light (height, width, 3) with all at one range."""
-        sharp = cv2.GaussianBlur(light, (0, 0), self.blur_at_px(range_m, camera.K[0, 0]))
-        small = cv2.resize(light, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+        """Return the picture (height, width, 3), sRGB, of linear light with all at one range.
+
+        A lens blurs what pixels then average: light (finer height, finer width, 3) has ``finer`` times the picture's
+        resolution, a whole number.  At 1, edges along the pixel grid are up to 0.04 px off (see ``render.develop``).
+
+        Raises ValueError when the light is not of such a size.
+        """
+        finer, size = light.shape[1] // camera.width, (camera.width, camera.height)
+        if finer < 1 or light.shape != (finer * camera.height, finer * camera.width, 3):
+            raise ValueError(f"light must be a whole number of times the picture's size {size}, got {light.shape}")
+        sharp = cv2.GaussianBlur(light, (0, 0), finer * self.blur_at_px(range_m, camera.K[0, 0]))
+        sharp = cv2.resize(sharp, size, interpolation=cv2.INTER_AREA)
+        quarter = (camera.width // 4, camera.height // 4)
+        small = cv2.resize(light, quarter, interpolation=cv2.INTER_AREA)
         small = cv2.GaussianBlur(np.minimum(small, 4.0), (0, 0), GLOW_SIGMA_PX / 4)
-        glow = cv2.resize(small, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+        glow = cv2.resize(small, size, interpolation=cv2.INTER_LINEAR)
         light = (sharp * (1 - self.glow) + glow * self.glow) * _vignette(camera, self.vignetting)
         electrons = np.clip(light, 0, 1) * np.float32(self.full_well_e)
         noise = rng.standard_normal(electrons.shape, dtype=np.float32)

@@ -23,8 +23,10 @@ from astratag.transforms import inverse, transform
 from pipeline.mission import Mission, Section
 from pipeline.render import (
     BLACK_ALBEDO,
+    FINER,
     NEAR_PLANE_M,
     WHITE_ALBEDO,
+    finer_camera,
     hit_print,
     ray_lattice,
     srgb_from_linear,
@@ -34,8 +36,8 @@ from pipeline.texture import PRINT_UNITS, Image, print_coverage
 
 Array = NDArray[np.float64]
 
-GRID_PX = 4
-"""Rays are cast at every so many pixels and interpolated: 0.002 px off for a marker tilted by 20 degrees."""
+GRID_PX = 4 * FINER
+"""Rays are cast at every so many fine pixels and interpolated: 0.002 px off for a marker tilted by 20 degrees."""
 ADC_MAX = 4095
 NOISE_MARGIN_PX = 97
 """Noise is a stored field, read at a random place of so many."""
@@ -60,8 +62,8 @@ class SensorSection(Section):
     full_well_e: float = Field(default=12000.0, gt=0)
     read_noise_e: float = Field(default=4.0, ge=0)
     vignetting: float = Field(default=0.18, ge=0, lt=1)
-    rays: int = Field(default=2, ge=1, le=7)
-    """Samples a pixel."""
+    rays: int = Field(default=FINER**2, ge=1, le=64)
+    """Samples a pixel: light is drawn finer, with one or more a fine pixel."""
     jpeg_quality: int = Field(default=95, ge=1, le=100)
 
 
@@ -115,7 +117,7 @@ class SimCamera:
     """A calibrated camera that sees the markers of a mission, always with the same noise for the same seed."""
 
     def __init__(self, camera: Camera, mission: Mission, *, light: LightSection, sensor: SensorSection, seed: int):
-        self._camera, self._light, self._sensor, self._seed = camera, light, sensor, seed
+        self._camera, self._fine, self._light, self._sensor, self._seed = camera, finer_camera(camera), light, sensor, seed
         dictionary = load_dictionary(mission.dictionary)
         self._bodies = [
             (
@@ -125,7 +127,7 @@ class SimCamera:
             )
             for marker in mission.markers
         ]
-        self._grid_rays = _grid_rays(camera)
+        self._grid_rays = _grid_rays(self._fine)
         self._vignette = _vignette(camera, sensor.vignetting)
         rng = np.random.default_rng(seed)
         shape = (camera.height + NOISE_MARGIN_PX, camera.width + NOISE_MARGIN_PX)
@@ -138,7 +140,7 @@ class SimCamera:
 
         ``glare`` is light that falls on the sensor everywhere: at 1 there is nothing else to be seen.
         """
-        light = np.full((self._camera.height, self._camera.width), self._light.sky, np.float32)
+        light = np.full((self._fine.height, self._fine.width), self._light.sky, np.float32)
         nearest_last = sorted(self._bodies, key=lambda body: -float((T_cam_target @ body[2])[2, 3]))
         for panel, surface, T_target_marker in nearest_last:
             self._lay(light, panel, surface, T_cam_target @ T_target_marker)
@@ -152,8 +154,8 @@ class SimCamera:
         return data.tobytes()
 
     def _lay(self, light: Image, panel: Panel, surface: Surface, T_cam_panel: Array) -> None:
-        """Put a panel over the linear picture ``light`` (height, width)."""
-        half_m, camera = panel.width_m / 2, self._camera
+        """Put a panel over linear light (finer height, finer width)."""
+        half_m, camera = panel.width_m / 2, self._fine
         if isinstance(surface, Cylinder):
             half_m = min(half_m, surface.radius_m)  # what is bent further away is hidden or edge-on
         grid = np.linspace(-half_m, half_m, 9)
@@ -169,7 +171,7 @@ class SimCamera:
         behind = light[part]
         total = np.zeros_like(behind)
         rays, right, down = (r[rows.start : rows.stop + 2, columns.start : columns.stop + 2] for r in self._grid_rays)
-        samples = ray_lattice(self._sensor.rays)
+        samples = ray_lattice(max(self._sensor.rays // FINER**2, 1))
         T_panel_cam = inverse(T_cam_panel)
         for dx, dy in samples:
             x, y, stretch, seen = hit_print(surface, T_panel_cam, rays + dx * right + dy * down)
@@ -197,7 +199,8 @@ class SimCamera:
     def _expose(self, light: Image, t_ns: int) -> NDArray[np.uint8]:
         sensor, camera = self._sensor, self._camera
         if sensor.blur_px > 0:
-            light = cv2.GaussianBlur(light, (0, 0), sensor.blur_px, borderType=cv2.BORDER_REPLICATE)
+            light = cv2.GaussianBlur(light, (0, 0), FINER * sensor.blur_px, borderType=cv2.BORDER_REPLICATE)
+        light = cv2.resize(light, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
         electrons = cv2.multiply(cv2.min(light, 1.0), self._vignette, scale=sensor.full_well_e)
         rng = np.random.default_rng((self._seed, t_ns))
         row, column = rng.integers(NOISE_MARGIN_PX, size=2)
@@ -209,7 +212,7 @@ class SimCamera:
 def _grid_rays(camera: Camera) -> tuple[Array, Array, Array]:
     """Return x/z and y/z of rays (R, C, 2) on a grid around the picture, and their change a pixel right and down.
 
-    Cell k stands for pixels 4 (k - 1) to 4 (k - 1) + 3: its ray goes through their middle.
+    Cell k stands for pixels 8 (k - 1) to 8 (k - 1) + 7: its ray goes through their middle.
     """
     rows, columns = (
         (np.arange(-(-n // GRID_PX) + 2) - 1.0) * GRID_PX + (GRID_PX - 1) / 2 for n in (camera.height, camera.width)

@@ -24,7 +24,7 @@ from astratag.dictionary import load_dictionary
 from pipeline.convert import NS_PER_S, calibration_message
 from pipeline.mission import CameraSection, CylinderSection, MarkerSection, Mission, PoseSection
 from pipeline.recording import RecordingWriter
-from pipeline.render import pixel_rays
+from pipeline.render import finer_camera, pixel_rays
 from pipeline.scenario import Approach, frame_stamps_ns, truth_message
 from pipeline.scene import Scene, Sun
 from pipeline.sensor import Sensor
@@ -35,7 +35,7 @@ SEED = 20260712
 START_NS = 1_783_814_400 * NS_PER_S  # 2026-07-12T00:00:00Z
 FRAME_RATE_HZ = 15.0
 EXPOSURE_S = 0.006
-RAYS = 5
+RAYS = 3
 JPEG_QUALITY = 83
 PROCESSES = 2
 
@@ -118,7 +118,7 @@ def picture(stamp_ns: int) -> NDArray[np.uint8]:
     """Return the camera's picture (height, width, 3), RGB, mid-exposure at ``stamp_ns``."""
     middle_s = (stamp_ns - START_NS) / NS_PER_S
     instants_s = middle_s + EXPOSURE_S * ((np.arange(RAYS) + 0.5) / RAYS - 0.5)
-    light = scene().light(CAMERA, [APPROACH.at(float(t_s)).T_a_b for t_s in instants_s])
+    light = scene().light(finer_camera(CAMERA), [APPROACH.at(float(t_s)).T_a_b for t_s in instants_s])
     range_m = APPROACH.at(middle_s).T_a_b[2, 3]
     return Sensor().expose(light, CAMERA, range_m=range_m, rng=np.random.default_rng((SEED, stamp_ns - START_NS)))
 
@@ -127,10 +127,12 @@ def picture(stamp_ns: int) -> NDArray[np.uint8]:
 def scene() -> Scene:
     """Return the scene, built once a process."""
     cv2.setNumThreads(1)
-    pixel_rays(CAMERA)
+    fine = finer_camera(CAMERA)
+    pixel_rays(fine)
     rng = np.random.default_rng(SEED)
     bodies = target(load_dictionary(MISSION.dictionary).signature(MARKER_ID), SIDE_M, rng)
-    return Scene(bodies, Sun(TO_SUN_CAM / np.linalg.norm(TO_SUN_CAM), SUN_IRRADIANCE), sky(CAMERA, rng))
+    behind = cv2.resize(sky(CAMERA, rng), (fine.width, fine.height), interpolation=cv2.INTER_LINEAR)
+    return Scene(bodies, Sun(TO_SUN_CAM / np.linalg.norm(TO_SUN_CAM), SUN_IRRADIANCE), behind)
 
 
 if __name__ == "__main__":

@@ -6,11 +6,11 @@ import pytest
 from astratag.camera import Camera
 from astratag.detector import Detector
 from astratag.dictionary import load_dictionary
-from astratag.surface import Cylinder, Flat
+from astratag.surface import Cylinder
 from astratag.transforms import exp_so3, inverse, pose
 from pipeline.convert import pose_matrix
 from pipeline.mission import CylinderSection, MarkerSection, Mission
-from pipeline.render import develop, lay_print
+from pipeline.render import render_marker, srgb_from_linear
 from pipeline.scenario import FACING, Approach
 from pipeline.sim_camera import LightSection, SensorSection, SimCamera, SimCameraSection
 from pipeline.sim_source import SimScenario, SimSource
@@ -59,11 +59,12 @@ def test_the_detector_measures_the_true_pose(T: np.ndarray, surface: CylinderSec
 @pytest.mark.parametrize("T", POSES)
 def test_against_the_exact_renderer(T: np.ndarray):
     """Within a grey level of the ray caster's picture on average, and a few levels on the steepest edges."""
-    light = np.full((CAMERA.height, CAMERA.width), 0.85, np.float32)
     signature = load_dictionary("astratag20").signature(7)
-    light = lay_print(light, CAMERA, T, signature=signature, side_m=SIDE_M, surface=Flat(), samples=16)
-    exact = develop(light, blur_px=1.0, noise_sigma=0.0).astype(float)
-    fast = seen(T, sensor=PLAIN.model_copy(update={"rays": 7}))
+    white = float(srgb_from_linear(np.float32(EVEN.sky)) * 255)
+    exact = render_marker(
+        CAMERA, T, signature=signature, side_m=SIDE_M, blur_px=PLAIN.blur_px, noise_sigma=0, background=white, samples=64
+    ).astype(float)
+    fast = seen(T, sensor=PLAIN.model_copy(update={"rays": 28}))
     assert np.abs(fast - exact).mean() < 1.0
     assert np.percentile(np.abs(fast - exact), 99.9) < 6
 

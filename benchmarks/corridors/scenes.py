@@ -23,6 +23,7 @@ from pipeline.convert import NS_PER_S, calibration_message
 from pipeline.mapping.estimate import pose_section
 from pipeline.mission import CameraSection, CylinderSection, MarkerSection, Mission, PoseSection
 from pipeline.recording import RecordingWriter
+from pipeline.render import finer_camera
 from pipeline.scenario import Approach, frame_stamps_ns, truth_message
 from pipeline.scene import Scene, Sun
 from pipeline.sensor import Sensor
@@ -143,7 +144,7 @@ def picture_at(corridor: Corridor, scene: Scene, t_s: float) -> bytes:
     """Return the picture taken with mid-exposure at ``t_s``."""
     T_marker_target = inverse(corridor.mission.markers[0].T_target_marker.matrix())
     instants_s = t_s + EXPOSURE_S * ((np.arange(RAYS) + 0.5) / RAYS - 0.5)
-    light = scene.light(CAMERA, [corridor.approach.at(float(t)).T_a_b @ T_marker_target for t in instants_s])
+    light = scene.light(finer_camera(CAMERA), [corridor.approach.at(float(t)).T_a_b @ T_marker_target for t in instants_s])
     rng = np.random.default_rng((corridor.seed, round(t_s * 1e6)))
     picture = Sensor().expose(light, CAMERA, range_m=corridor.approach.at(t_s).T_a_b[2, 3], rng=rng)
     quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
@@ -166,6 +167,7 @@ def scene_of(corridor: Corridor) -> Scene:
         else:
             shape = Plate(1.1 * half_m, 1.1 * half_m)
         bodies.append(Body(shape, paint, marker.T_target_marker.matrix()))
-    sky = np.zeros((CAMERA.height, CAMERA.width, 3), np.float32)
+    fine = finer_camera(CAMERA)
+    sky = np.zeros((fine.height, fine.width, 3), np.float32)
     to_sun = np.array(corridor.to_sun_cam)
     return Scene(bodies, Sun(to_sun / np.linalg.norm(to_sun), corridor.irradiance), sky)
