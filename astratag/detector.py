@@ -230,7 +230,8 @@ class Detector(Confirmer):
         """Return the markers bent about cylinders so much, or so far turned, that none was found otherwise."""
         if not self._bends:
             return []
-        found, outlines = self._search_bent(view, _outlines(view, THIN)), _outlines(view, NARROW)
+        outlines = _outlines(view, NARROW)
+        found = self._search_bent(view, _outlines(view, THIN)) or self._search_bent_about(view, quads_of(outlines))
         if found or not view.effort.spend(COST.near_pixel * outlines.followed):
             return found
         sides = near_sides(outlines)
