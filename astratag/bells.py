@@ -57,7 +57,7 @@ class Pull(NamedTuple):
 
 
 @compiled(
-    LINES, LINE_NUMBERS, VECTOR, INDICES, MATRIX, MATRIX, MATRIX, MATRIX, MATRIX, MATRIX, REAL, VECTOR, FLAG_MATRIX
+    LINES, LINE_NUMBERS, VECTOR, INDICES, MATRIX, MATRIX, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR, VECTOR, FLAG_MATRIX
 )
 def around(
     places: Single,
@@ -70,7 +70,7 @@ def around(
     squeeze: Array,
     margin_px: Array,
     backdrop: Array,
-    blur_px: float,
+    blur_px: Array,
     beside_px: Array,
     use: Mask,
 ) -> Array:
@@ -78,20 +78,21 @@ def around(
 
     Each is ``AWAY`` so many pixels along the profile, and the ``CHANGE`` of brightness there crosses it at an angle of
     that ``COSINE`` and ``SINE``; along the other edge, from where the point is beside it, it is so many pixels to its
-    ``BEGIN`` and ``FINISH``.  The first without a change ends the list.  Those within reach of ``blur_px`` are listed,
+    ``BEGIN`` and ``FINISH``.  The first without a change ends the list.  Those within reach of ``blur_px`` (E,) are listed,
     the edge's own among them, and the end of the margin; nothing when no crossings are known.  These are the fields of
     ``neighbours.Crossings``, how edges look those of ``locate.Edges``; what changes at the end of the margin is the
     ``backdrop`` (E, M).
     """
-    listed, far_px = len(places) // len(LEANS), BELL_ENDS * blur_px
+    listed = len(places) // len(LEANS)
     seen = np.zeros((len(edges) if listed else 0, use.shape[1], MOST_BELLS, 6))
     for e in range(len(seen)):
+        far_px = BELL_ENDS * blur_px[e]
         for m in range(use.shape[1]):
             if not use[e, m]:
                 continue
             nearest = min(max(round((lean[e, m] - LEANS[0]) / LEAN_STEP), 0), len(LEANS) - 1)
             row, more = nearest * listed + edges[e], lean[e, m] - LEANS[nearest]
-            narrow = squeeze[e, m] * beside_px[e] / blur_px
+            narrow = squeeze[e, m] * beside_px[e] / blur_px[e]
             along_px, n = unit_px[e, m] / narrow, 0
             if backdrop[e, m] != 0.0 and margin_px[e, m] < far_px:
                 seen[e, m, 0, AWAY], seen[e, m, 0, CHANGE], seen[e, m, 0, COSINE] = margin_px[e, m], backdrop[e, m], 1.0
@@ -166,21 +167,21 @@ def _sum_of_bells(bells: Array, count: int, x: float) -> tuple[float, float, flo
     return slope, curvature, height
 
 
-@compiled(BELLS, REAL, FLAG_MATRIX, MATRIX)
-def pull(beside: Array, blur_px: float, use: Mask, offset_px: Array) -> Pull:
+@compiled(BELLS, VECTOR, FLAG_MATRIX, MATRIX)
+def pull(beside: Array, blur_px: Array, use: Mask, offset_px: Array) -> Pull:
     """Return what neighbours, as ``around`` gives them, do to the points to ``use`` (E, M).
 
-    All is blurred by a standard deviation of ``blur_px``.  Newton's method on the sum of bells; then, as where points
+    All is blurred by standard deviations of ``blur_px`` (E,).  Newton's method on the sum of bells; then, as where points
     were found, ``offset_px`` (E, M), the top of the parabola through the three highest samples: between lopsided ones
     it lies elsewhere.
     """
     pull_px, roundness, bells = np.zeros(use.shape), np.ones(use.shape), np.empty((MOST_BELLS, 6))
-    step = STEP_PX / blur_px
     for e in range(use.shape[0]):
+        step = STEP_PX / blur_px[e]
         for m in range(use.shape[1]):
             if not use[e, m]:
                 continue
-            count = _prepared(beside, e, m, blur_px, bells)
+            count = _prepared(beside, e, m, blur_px[e], bells)
             slope, curvature, height = _sum_of_bells(bells, count, 0.0)
             x = slope / max(curvature, LEAST_CURVATURE)
             if abs(x) > LITTLE:
@@ -188,24 +189,24 @@ def pull(beside: Array, blur_px: float, use: Mask, offset_px: Array) -> Pull:
                 x += slope / max(curvature, LEAST_CURVATURE)
             believed = curvature >= LEAST_CURVATURE and height >= LEAST_CURVATURE
             if believed and x != 0.0:
-                middle = x - (offset_px[e, m] - STEP_PX * np.round(offset_px[e, m] / STEP_PX)) / blur_px
+                middle = x - (offset_px[e, m] - STEP_PX * np.round(offset_px[e, m] / STEP_PX)) / blur_px[e]
                 before = _sum_of_bells(bells, count, middle - step)[2]
                 after = _sum_of_bells(bells, count, middle + step)[2]
                 bend = 2 * _sum_of_bells(bells, count, middle)[2] - before - after
                 x = middle + step / 2 * (after - before) / max(bend, LEAST_CURVATURE * step * step)
-            pull_px[e, m] = x * blur_px if believed else np.nan
+            pull_px[e, m] = x * blur_px[e] if believed else np.nan
             roundness[e, m] = max(curvature, LEAST_CURVATURE)
     return Pull(pull_px, roundness)
 
 
-@compiled(BELLS, REAL, FLAG_MATRIX)
-def narrowing(beside: Array, blur_px: float, use: Mask) -> Array:
+@compiled(BELLS, VECTOR, FLAG_MATRIX)
+def narrowing(beside: Array, blur_px: Array, use: Mask) -> Array:
     """Return how much rounder (E, M) the tops of slopes are for their height than those of edges without neighbours."""
     rounder, bells = np.ones(use.shape), np.empty((MOST_BELLS, 6))
     for e in range(use.shape[0]):
         for m in range(use.shape[1]):
             if use[e, m]:
-                count = _prepared(beside, e, m, blur_px, bells)
+                count = _prepared(beside, e, m, blur_px[e], bells)
                 _, curvature, height = _sum_of_bells(bells, count, 0.0)
                 rounder[e, m] = max(curvature, LEAST_CURVATURE) / max(height, LEAST_CURVATURE)
     return rounder

@@ -174,6 +174,7 @@ def _measured(
     use = _usable(seen.found, seen.in_view, seen.reach_px)
     if not _on_all_sides(edges, use):
         use[:] = False
+    blur_px = np.hypot(seen.lens_px, seen.smoothing_px)
     beside = around(
         places,
         which,
@@ -184,10 +185,10 @@ def _measured(
         seen.lean,
         seen.squeeze,
         seen.margin_px,
-        backdrop(gray, of_gray, edges, seen.predicted_px, seen.normal, seen.margin_px, seen.blur_px),
-        seen.blur_px,
+        backdrop(gray, of_gray, edges, seen.predicted_px, seen.normal, seen.margin_px, seen.lens_px, blur_px),
+        blur_px,
         seen.beside_px,
-        within_reach(seen.reach_px, seen.blur_px, use | seen.alone),
+        within_reach(seen.reach_px, blur_px, use | seen.alone),
     )
     known = pulls_on(
         beside,
@@ -198,7 +199,8 @@ def _measured(
         seen.offset_px,
         seen.alone,
         use,
-        seen.blur_px,
+        seen.lens_px,
+        seen.smoothing_px,
     )
     if _on_all_sides(edges, use & ~known.lost):
         use &= ~known.lost

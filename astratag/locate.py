@@ -21,10 +21,10 @@ Mask = NDArray[np.bool_]
 
 STEP_PX = 0.5
 SMOOTHING_PX = 0.7
-"""Standard deviation of the derivative filter: little, so that neighbouring edges do not pull."""
+"""Standard deviation of the derivative filter, at least: little, so that neighbouring edges do not pull."""
 WITHIN_REACH = 0.6
 """An edge is looked for this fraction of the way to its nearest neighbour."""
-ROW_PX, MOST_ROWS, ROWS_WITHIN_PX, ROWS_REACH_PX = 1.6, 5, 2.0, 4.0
+ROW_PX, MOST_ROWS, ROWS_REACH_PX, CLOSE_PX = 1.6, 5, 4.0, 2.0
 """Points of an edge far apart are looked at in several rows side by side, so far from each other that their noise is
 their own: where they are looked for so near, and neighbours are so far away."""
 LEAST_LENS_PX = 0.4
@@ -41,9 +41,14 @@ LEAST_RISE, LEAST_RISE_GREY = 0.35, 0.05
 SATURATED, WHOLE_RISE, CLIPPED_PX = 250.0, 0.75, 1.7
 """Where paper is as bright as this, an edge that rises by less than this share of it is cut off at the top by glare,
 and looks so many pixels nearer to the ink for each share that is missing (at a blur of 0.8 pixels)."""
-SMOOTHING_OF_LENS, REACH_OF_SMOOTHING, WORTHWHILE = 0.8, 5.0, 1.4
-"""Width of the filter for blurred edges: over the blur's, at most a part of their reach, and from which gain on."""
-SMOOTHING_STEP_PX = 0.25
+SMOOTHING_OF_LENS, CLOSE_SMOOTHING_OF_LENS, REACH_OF_SMOOTHING, WORTHWHILE = 0.8, 1.8, 4.0, 1.4
+"""Width of the filter over the blur's, also where edges are known to a pixel or two, at most a part of their reach; and
+from which gain on edges are looked for once more.
+
+The steepest place is the less noisy the wider the filter: by 2.6, 1.8 and 1.5 times what an edge's light tells of it
+(0.7, 1 and 1.5 pixels, through a blur of 0.85).
+"""
+USUAL_LENS_PX = 0.85
 FILTER_REACH, BESIDE_PX = 3.5, 0.3
 """Where the filter ends, in its standard deviations; and how near its middle may come to where profiles end."""
 APART_PX = 3.0
@@ -64,8 +69,9 @@ class Edges(NamedTuple):
     margin looks.
 
     ``offset_px`` (E, M) is the distance from there along the normals; only where ``found``, which is only where
-    ``in_view``.  The points ``alone`` (E, M) are those furthest from their neighbours; ``blur_px`` is the standard
-    deviation of all that blurs these: lens, pixel, interpolation, derivative filter, and neighbours a little.
+    ``in_view``.  The points ``alone`` (E, M) are those furthest from their neighbours; ``lens_px`` is the standard
+    deviation of what blurs these: lens, pixel, interpolation, and neighbours a little.  The derivative filter of each
+    edge blurs by ``smoothing_px`` (E,) besides.
     ``clipped_px`` (E, M) is how far saturation may have moved the edge.  Each point is the mean of ``rows`` (E,) side
     by side, which blur along the edge, as the lens does and the filter does not: by ``beside_px`` (E,).
     """
@@ -83,8 +89,9 @@ class Edges(NamedTuple):
     found: Mask
     in_view: Mask
     alone: Mask
-    blur_px: float
+    lens_px: float
     clipped_px: Array
+    smoothing_px: Array
     rows: NDArray[np.int64]
     beside_px: Array
 
@@ -138,9 +145,12 @@ def _lie(
     return predicted, normal, length, unit_px, growth_px, lean, squeeze, reach_px, margin_px
 
 
-@compiled(CUBE, FLAGS, REAL, INT, INT)
-def _in_view(predicted_px: Array, facing: Mask, profile_px: float, height: int, width: int) -> Mask:
-    """Return which points (E, M) are on edges whose few points (5 E) all face the viewer, and well inside the image."""
+@compiled(CUBE, FLAGS, VECTOR, INT, INT)
+def _in_view(predicted_px: Array, facing: Mask, profile_px: Array, height: int, width: int) -> Mask:
+    """Return which points (E, M) are on edges whose few points (5 E) all face the viewer, and well inside the image.
+
+    Profiles reach ``profile_px`` (E,) to either side.
+    """
     _, edges, points = predicted_px.shape
     few = len(facing) // edges
     in_view = np.zeros((edges, points), np.bool_)
@@ -148,8 +158,8 @@ def _in_view(predicted_px: Array, facing: Mask, profile_px: float, height: int, 
         if facing[e * few : (e + 1) * few].all():
             for m in range(points):
                 x, y = predicted_px[0, e, m], predicted_px[1, e, m]
-                across = profile_px <= x <= width - 1 - profile_px
-                in_view[e, m] = across and profile_px <= y <= height - 1 - profile_px
+                across = profile_px[e] <= x <= width - 1 - profile_px[e]
+                in_view[e, m] = across and profile_px[e] <= y <= height - 1 - profile_px[e]
     return in_view
 
 
@@ -265,9 +275,16 @@ def _covered(ink: Array, paper: Array, reach_px: Array) -> Mask:
     return covered
 
 
-@compiled(MATRIX, MATRIX, MATRIX, MATRIX, MATRIX, FLAG_MATRIX, VECTOR)
+@compiled(MATRIX, MATRIX, MATRIX, MATRIX, MATRIX, FLAG_MATRIX, VECTOR, VECTOR)
 def _judged(
-    ink: Array, paper: Array, offset_px: Array, rise: Array, beside: Array, in_view: Mask, reach_px: Array
+    ink: Array,
+    paper: Array,
+    offset_px: Array,
+    rise: Array,
+    beside: Array,
+    in_view: Mask,
+    reach_px: Array,
+    smoothing_px: Array,
 ) -> tuple[Mask, Mask, float, Array]:
     """Return which points (E, M) are found and which of them stand alone, the blur, and how far clipping moved them."""
     edges, points = rise.shape
@@ -286,20 +303,23 @@ def _judged(
     for e in range(edges):
         if found[e].any():
             widest_px = max(widest_px, reach_px[e])
-    alone, slopes_beside, squared = np.zeros(rise.shape, np.bool_), 0.0, 0.0
+    alone, lens_px2, in_all = np.zeros(rise.shape, np.bool_), 0.0, 1e-9
     for e in range(edges):
-        if reach_px[e] >= MOST_ALONE * widest_px:
+        if reach_px[e] >= MOST_ALONE * widest_px and found[e].any():
+            slopes_beside, squared = 0.0, 0.0
             for m in range(points):
                 if found[e, m]:
                     alone[e, m] = True
                     slopes_beside += beside[e, m]
                     squared += rise[e, m] * rise[e, m]
-    # slopes are bells; a Gaussian's logarithm is a parabola, whose width its values at the top and beside it tell
-    ratio = min(max(slopes_beside / max(squared, 1e-9), LOW_RATIO), HIGH_RATIO)
-    return found, alone, STEP_PX / np.sqrt(-np.log(ratio)), clipped_px
+            # slopes are bells; a Gaussian's logarithm is a parabola, whose width its values at the top and beside it tell
+            ratio = min(max(slopes_beside / max(squared, 1e-9), LOW_RATIO), HIGH_RATIO)
+            lens_px2 += squared * (STEP_PX**2 / -np.log(ratio) - smoothing_px[e] ** 2)
+            in_all += squared
+    return found, alone, np.sqrt(max(lens_px2 / in_all, LEAST_LENS_PX**2)), clipped_px
 
 
-@compiled(GRAY, VECTOR, CUBE, CUBE, VECTOR, FLAGS, INDICES, REAL, REAL)
+@compiled(GRAY, VECTOR, CUBE, CUBE, VECTOR, FLAGS, INDICES, REAL, VECTOR)
 def _seen(
     gray: NDArray[np.uint8],
     of_gray: Array,
@@ -309,28 +329,29 @@ def _seen(
     facing: Mask,
     rows: NDArray[np.int64],
     search_px: float,
-    smoothing_px: float,
+    smoothing_px: Array,
 ) -> tuple[Array, Mask, Mask, Mask, float, Array]:
-    """Return where edges are found through a filter of standard deviation ``smoothing_px``: the rest of ``Edges``."""
-    half = int(np.ceil((search_px + 3 * smoothing_px) / STEP_PX))
-    within_px = min(search_px, half * STEP_PX - 3 * smoothing_px + BESIDE_PX)
+    """Return where edges are found through filters of standard deviation ``smoothing_px`` (E,): most of ``Edges``."""
     _, edges, points = predicted_px.shape
-    in_view = _in_view(predicted_px, facing, half * STEP_PX, gray.shape[0], gray.shape[1])
-    weights = _derivative(smoothing_px)
+    halves = np.ceil((search_px + 3 * smoothing_px) / STEP_PX).astype(np.int64)
+    in_view = _in_view(predicted_px, facing, halves * STEP_PX, gray.shape[0], gray.shape[1])
     ink, paper = np.empty((edges, points)), np.empty((edges, points))
     offset_px, rise, beside = np.empty((edges, points)), np.empty((edges, points)), np.empty((edges, points))
     for e in range(edges):
-        limit_px = WITHIN_REACH * reach_px[e]
+        half, limit_px = halves[e], WITHIN_REACH * reach_px[e]
+        within_px = min(search_px, half * STEP_PX - 3 * smoothing_px[e] + BESIDE_PX)
         kept = int(((limit_px if limit_px < within_px else within_px) + 1e-9) / STEP_PX)
         profiles = _profiles(gray, of_gray, predicted_px, normal, e, half, rows[e])
         ink[e], paper[e] = _extremes(profiles)
-        offset_px[e], rise[e], beside[e] = _steepest_rise(_slopes(profiles, weights, kept + 1))
-    found, alone, blur_px, clipped_px = _judged(ink, paper, offset_px, rise, beside, in_view, reach_px)
+        offset_px[e], rise[e], beside[e] = _steepest_rise(
+            _slopes(profiles, _derivative(smoothing_px[e]), kept + 1)
+        )
+    found, alone, lens_px, clipped_px = _judged(ink, paper, offset_px, rise, beside, in_view, reach_px, smoothing_px)
     for e in range(edges):
         for m in range(points):
             if not found[e, m]:
                 offset_px[e, m] = 0.0
-    return offset_px, found, in_view, alone, blur_px, clipped_px
+    return offset_px, found, in_view, alone, lens_px, clipped_px
 
 
 @compiled(VECTOR, VECTOR, REAL)
@@ -338,7 +359,7 @@ def _rows(length_px: Array, reach_px: Array, search_px: float) -> NDArray[np.int
     """Return in how many rows (E,) points of edges (E,) are looked at."""
     rows = np.ones(len(length_px), np.int64)
     for e in range(len(length_px)):
-        if search_px <= ROWS_WITHIN_PX and reach_px[e] >= ROWS_REACH_PX:
+        if search_px <= CLOSE_PX and reach_px[e] >= ROWS_REACH_PX:
             apart_px = length_px[e] / (ALONG_SHARE * POINTS_PER_EDGE)
             rows[e] = min(max(int(apart_px / ROW_PX), 1), MOST_ROWS)
     return rows
@@ -363,6 +384,15 @@ def _straighten(predicted_px: Array, normal: Array, beside_px: Array, found: Mas
                 offset_px[e, m] -= beside_px[e] ** 2 / 2 * bend / squared_px
 
 
+@compiled(VECTOR, REAL)
+def _smoothing(reach_px: Array, wanted_px: float) -> Array:
+    """Return how wide the filters of edges (E,) are, where neighbours leave room for it as wide as is wanted."""
+    smoothing_px = np.empty(len(reach_px))
+    for e in range(len(reach_px)):
+        smoothing_px[e] = max(min(wanted_px, reach_px[e] / REACH_OF_SMOOTHING), SMOOTHING_PX)
+    return smoothing_px
+
+
 @compiled(GRAY, VECTOR, CUBE, FLAGS, VECTOR, VECTOR, VECTOR, VECTOR, REAL)
 def locate(
     gray: NDArray[np.uint8],
@@ -385,12 +415,13 @@ def locate(
     lie = _lie(seen_px, to_paper, reach, spacing, outside)
     predicted, normal, reach_px = lie[0], lie[1], lie[7]
     rows = _rows(lie[2], reach_px, search_px)
-    seen = _seen(gray, of_gray, predicted, normal, reach_px, facing, rows, search_px, SMOOTHING_PX)
-    smoothing_px, lens_px = SMOOTHING_PX, np.sqrt(seen[4] ** 2 - SMOOTHING_PX**2)
-    wider_px = min(SMOOTHING_OF_LENS * lens_px, reach_px.max() / REACH_OF_SMOOTHING)
-    if wider_px >= WORTHWHILE * SMOOTHING_PX:
-        smoothing_px = round(wider_px / SMOOTHING_STEP_PX) * SMOOTHING_STEP_PX
+    of_lens = CLOSE_SMOOTHING_OF_LENS if search_px <= CLOSE_PX else SMOOTHING_OF_LENS
+    smoothing_px = _smoothing(reach_px, of_lens * USUAL_LENS_PX)
+    seen = _seen(gray, of_gray, predicted, normal, reach_px, facing, rows, search_px, smoothing_px)
+    wider_px = _smoothing(reach_px, of_lens * seen[4])
+    if wider_px.max() >= WORTHWHILE * smoothing_px.max():
+        smoothing_px = wider_px
         seen = _seen(gray, of_gray, predicted, normal, reach_px, facing, rows, search_px, smoothing_px)
-    beside_px = np.sqrt(max(seen[4] ** 2 - smoothing_px**2, LEAST_LENS_PX**2) + ROW_PX**2 * (rows**2 - 1) / 12)
+    beside_px = np.sqrt(seen[4] ** 2 + ROW_PX**2 * (rows**2 - 1) / 12)
     _straighten(predicted, normal, beside_px, seen[1], seen[0])
-    return Edges(*lie, *seen, rows, beside_px)
+    return Edges(*lie, *seen, smoothing_px, rows, beside_px)

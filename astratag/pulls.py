@@ -11,6 +11,7 @@ from astratag.backdrop import FAR_MARGIN, OUTERMOST, THIN_MARGIN
 from astratag.bells import narrowing, pull
 from astratag.compiled import BELLS, FLAG_MATRIX, INDICES, MATRIX, REAL, VECTOR, compiled
 from astratag.edges import POINTS_PER_EDGE
+from astratag.locate import LEAST_LENS_PX, SMOOTHING_PX
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -60,34 +61,37 @@ def _unknown(reach_px: Array, clipped_px: Array) -> Pulls:
     return Pulls(none, variance, np.ones(clipped_px.shape), none, np.zeros(clipped_px.shape, np.bool_))
 
 
-@compiled(BELLS, VECTOR, FLAG_MATRIX, REAL)
-def _blur_alone(beside: Array, reach_px: Array, alone: Mask, seen_px: float) -> float:
-    """Return the blur that edges would show without neighbours, which narrow or widen them to what is ``seen_px``."""
-    nearest_px, points = np.inf, 0
+@compiled(BELLS, VECTOR, FLAG_MATRIX, REAL, VECTOR)
+def _lens_alone(beside: Array, reach_px: Array, alone: Mask, seen_px: float, smoothing_px: Array) -> float:
+    """Return the blur that edges would show without neighbours, which narrow or widen them to what is ``seen_px``.
+
+    Without what the filters, ``smoothing_px`` (E,), add to it.
+    """
+    nearest, points = np.inf, 0
     for e in range(len(reach_px)):
         if alone[e].any():
-            nearest_px = min(nearest_px, reach_px[e])
+            nearest = min(nearest, reach_px[e] / np.hypot(seen_px, smoothing_px[e]))
             points += int(np.count_nonzero(alone[e]))
-    blur_px = seen_px
-    if points == 0 or nearest_px > FAR_REACH * seen_px:
-        return blur_px
+    lens_px = seen_px
+    if points == 0 or nearest > FAR_REACH:
+        return lens_px
     for _ in range(MOST_BLUR_STEPS):
-        narrowed, rounder = 0.0, narrowing(beside, blur_px, alone)
+        lens_px2, rounder = 0.0, narrowing(beside, np.hypot(lens_px, smoothing_px), alone)
         for e in range(len(reach_px)):
             for m in range(alone.shape[1]):
                 if alone[e, m]:
-                    narrowed += rounder[e, m]
-        before_px, blur_px = blur_px, seen_px * np.sqrt(narrowed / points)
-        if abs(blur_px - before_px) < SAME_BLUR * before_px:
+                    lens_px2 += rounder[e, m] * (seen_px**2 + smoothing_px[e] ** 2) - smoothing_px[e] ** 2
+        before_px, lens_px = lens_px, np.sqrt(max(lens_px2 / points, LEAST_LENS_PX**2))
+        if abs(lens_px - before_px) < SAME_BLUR * before_px:
             break
-    return blur_px
+    return lens_px
 
 
-@compiled(MATRIX, MATRIX, REAL, INDICES, MATRIX, MATRIX)
+@compiled(MATRIX, MATRIX, VECTOR, INDICES, MATRIX, MATRIX)
 def _known(
     pull_px: Array,
     keen: Array,
-    blur_px: float,
+    blur_px: Array,
     edges: NDArray[np.int64],
     margin_px: Array,
     clipped_px: Array,
@@ -98,31 +102,42 @@ def _known(
     for e in range(pull_px.shape[0]):
         for m in range(pull_px.shape[1]):
             size_px = abs(pull_px[e, m])
-            if size_px <= MOST_PULL * blur_px:
+            if size_px <= MOST_PULL * blur_px[e]:
                 believed[e, m] = pull_px[e, m]
-                growth[e, m] = pull_px[e, m] * (1 + PULL_GROWTH / blur_px * size_px)
+                growth[e, m] = pull_px[e, m] * (1 + PULL_GROWTH / blur_px[e] * size_px)
                 wrong_px2 = (PULL_REST * size_px) ** 2 + PULL_FLOOR_PX**2
-                margin = margin_px[e, m] / blur_px
+                margin = margin_px[e, m] / blur_px[e]
                 if edges[e] < OUTERMOST and margin < FAR_MARGIN:
                     margin = max(margin, THIN_MARGIN)
-                    wrong_px2 += (BACKGROUND * blur_px * margin * np.exp(-0.5 * margin * margin)) ** 2
+                    wrong_px2 += (BACKGROUND * blur_px[e] * margin * np.exp(-0.5 * margin * margin)) ** 2
             else:
                 lost[e, m], wrong_px2 = True, LOST_PX**2
             variance[e, m] = POINTS_PER_EDGE * (wrong_px2 + clipped_px[e, m] ** 2)  # glare moves a whole edge alike
     return Pulls(believed, variance, keen.copy(), growth, lost)
 
 
-@compiled(VECTOR, REAL, FLAG_MATRIX)
-def within_reach(reach_px: Array, blur_px: float, points: Mask) -> Mask:
+@compiled(REAL, REAL)
+def _quieter(lens_px: float, smoothing_px: float) -> float:
+    """Return how much less noise moves an edge through a filter than through the narrowest, both wide as the lens.
+
+    The second derivative through a filter is as noisy as the power of -5/2 of its width, and crosses zero as steeply
+    as that of -3 of all blur.
+    """
+    squared = (lens_px**2 + SMOOTHING_PX**2) / (lens_px**2 + smoothing_px**2)
+    return squared**1.5 * (smoothing_px / SMOOTHING_PX) ** 2.5
+
+
+@compiled(VECTOR, VECTOR, FLAG_MATRIX)
+def within_reach(reach_px: Array, blur_px: Array, points: Mask) -> Mask:
     """Return which of the points (E, M) are on edges whose neighbours (E,) are near enough to pull."""
     pulled = np.zeros(points.shape, np.bool_)
     for e in range(len(reach_px)):
-        if reach_px[e] < FAR_REACH * blur_px:
+        if reach_px[e] < FAR_REACH * blur_px[e]:
             pulled[e] = points[e]
     return pulled
 
 
-@compiled(BELLS, INDICES, VECTOR, MATRIX, MATRIX, MATRIX, FLAG_MATRIX, FLAG_MATRIX, REAL)
+@compiled(BELLS, INDICES, VECTOR, MATRIX, MATRIX, MATRIX, FLAG_MATRIX, FLAG_MATRIX, REAL, VECTOR)
 def pulls_on(
     beside: Array,
     edges: NDArray[np.int64],
@@ -132,7 +147,8 @@ def pulls_on(
     offset_px: Array,
     alone: Mask,
     use: Mask,
-    blur_px: float,
+    lens_px: float,
+    smoothing_px: Array,
 ) -> Pulls:
     """Return what is known of the pulls on points to ``use`` (E, M) of E ``edges``.
 
@@ -141,6 +157,9 @@ def pulls_on(
     """
     if len(beside) == 0:
         return _unknown(reach_px, clipped_px)
-    blur_px = _blur_alone(beside, reach_px, alone, blur_px)
+    lens_px = _lens_alone(beside, reach_px, alone, lens_px, smoothing_px)
+    blur_px = np.hypot(lens_px, smoothing_px)
     found = pull(beside, blur_px, within_reach(reach_px, blur_px, use), offset_px)
+    for e in range(len(blur_px)):
+        found.curvature[e] *= _quieter(lens_px, smoothing_px[e])
     return _known(found.px, found.curvature, blur_px, edges, margin_px, clipped_px)
