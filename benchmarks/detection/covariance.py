@@ -8,7 +8,8 @@ the probability it has; those are counted apart, beside as many as these probabi
 Pictures are anti-aliased by more rays than recall needs: with 8 a pixel, edges are off by what some covariances claim.
 
 Errors are also held to the Cramer-Rao bound: no unbiased estimate of a pose has a smaller covariance than the inverse
-of what all pixels tell of it through their noise, were blur, light and background known exactly.
+of what all pixels of a marker tell of it through their noise, were blur and light known exactly.  A marker ends in the
+middle of its quiet margin: where its sheet was cut tells nothing.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from scipy.stats import chi2
 from astratag import Detection, Detector
 from astratag.transforms import difference, perturb
 from benchmarks.detection.peers import MARKERS, texture
-from benchmarks.detection.scenes import CONDITIONS, SHEET_M, Draw, draw
+from benchmarks.detection.scenes import CONDITIONS, SHEET_M, SIDE_M, Draw, draw
 from pipeline.texture import Texture
 
 Array = NDArray[np.float64]
@@ -48,6 +49,8 @@ LITTLE = 1e-6
 """A perturbation, metres or radians, that is as good as a derivative."""
 BOUNDED, BOUND_RAYS, STEP_PX = 5, 16, 0.25
 """The bound is found of every so many pictures, of so many rays a pixel, by moving the print by so much."""
+OUTLINE = 33
+"""Points on each side of a marker's outline, which may be bent."""
 FIRST_SEED = 5_000_000
 """Added to what recall starts from: pictures that no constant of the detector was chosen on."""
 
@@ -109,7 +112,7 @@ def band(poses: int) -> tuple[float, float]:
 def information_of(one: Draw, print_: Texture) -> Array:
     """Return what the pixels of a picture tell of the print's pose (6, 6): metres and radians, right perturbation."""
     sheet = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5]), axis=-1) * SHEET_M
-    slopes = []
+    marker, slopes = _marker_in(one), []
     for axis in np.eye(DEGREES_OF_FREEDOM):
         tiny = replace(one, T_cam_print=perturb(one.T_cam_print, LITTLE * axis))
         step = STEP_PX * LITTLE / np.abs(tiny.pixels(sheet) - one.pixels(sheet)).max()
@@ -117,8 +120,17 @@ def information_of(one: Draw, print_: Texture) -> Array:
             replace(one, T_cam_print=perturb(one.T_cam_print, by * axis)).expected(print_, BOUND_RAYS)
             for by in (step, -step)
         )
-        slopes.append((after - before).ravel().astype(float) / (2 * step))
+        slopes.append((after - before)[marker].astype(float) / (2 * step))
     return np.array(slopes) @ np.array(slopes).T / one.scene.noise_sigma**2
+
+
+def _marker_in(one: Draw) -> NDArray[np.bool_]:
+    """Return which pixels (height, width) show the print up to the middle of its quiet margin."""
+    along = np.linspace(-1, 1, OUTLINE)
+    sides = [(along, along * 0 + 1), (along * 0 + 1, -along), (-along, along * 0 - 1), (along * 0 - 1, along)]
+    outline = one.pixels(np.concatenate([np.stack(side, axis=1) for side in sides]) * (SIDE_M + SHEET_M) / 4)
+    picture = np.zeros((one.camera.height, one.camera.width), np.uint8)
+    return cv2.fillPoly(picture, [np.round(outline).astype(np.int32)], 1).astype(bool)
 
 
 def measure_covariance(condition: str, value: float, images: int) -> list[dict]:
