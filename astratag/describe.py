@@ -197,6 +197,7 @@ class Describer:
 
         What was read, and both planar poses, are those of the detection ``before`` it where there is one.
         """
+        aligned = self._synthesis.refined(view.lit, aligned, marker_id)
         square_px = aligned.warp(SQUARES[layer])
         if not inside(square_px, view.gray.shape):
             return None

@@ -21,12 +21,17 @@ Seeing = tuple[Seen, Array, Array, Array]
 REACH, LAYER_REACH = 0.07, 0.13
 """How far beyond the black square the print is looked at, as a fraction of its side; and to tell layers apart by."""
 SPACING_PX = 0.8
-MOST_LINES, MOST_AT_A_GLANCE, FEWEST_LINES = 32, 20, 12
-"""Grid lines across the print: so many that they are ``SPACING_PX`` apart where it looks widest, within bounds."""
+MOST_LINES, FINE_LINES, MOST_AT_A_GLANCE, FEWEST_LINES = 32, 64, 20, 12
+"""Grid lines across the print: so many that they are ``SPACING_PX`` apart where it looks widest, within bounds.
+
+Coarser ones find where a print is and how blurred; finer ones then measure it.
+"""
+MOST_SHIFT_PX = 0.03
+"""Where a blur moves what is seen by more, the print bends away too fast for its looks to be known."""
 HALF_UNIT = 0.5
 """How far derivatives by place reach, template units."""
 FEWEST_POINTS = 60
-SOFTNESS = tuple(4.0 * 2 ** (k / 2) for k in range(10))
+SOFTNESS = tuple(2.0 * 2 ** (k / 2) for k in range(12))
 """Blurs of pictures that are kept, template units, and"""
 SOFT_SHARE = 0.85
 """how much of the blur where it is least they may be: the rest is summed over nodes."""
@@ -72,6 +77,11 @@ def widest_px(warp: FittedWarp) -> float:
     return max(math.dist(p0, p1), math.dist(p1, p2), math.dist(p2, p3), math.dist(p3, p0), 1.0)
 
 
+def lines_across(warp: FittedWarp, most: int, reach: float = REACH) -> int:
+    """Return how many grid lines, at most so many, are laid across a print and ``reach`` sides around it."""
+    return int(min(max(widest_px(warp) * (1 + 2 * reach) / SPACING_PX, FEWEST_LINES), most))
+
+
 @compiled(FLAGS, INT, INT)
 def _inner(visible: Seen, lines: int, n: int) -> int:
     """Return the nearest of N points on a grid of ``lines`` that has neighbours all around, -1 if not all are seen."""
@@ -100,7 +110,8 @@ def _seen(stencil_px: Array, visible: Seen, height: int, width: int, spacing: fl
 
     ``stencil_px`` (3 N, 2) is where they are, and then their neighbours half a unit on; ``spacing`` the template units
     between them.  Of the M that are seen come pixels (M, 2), matrices (M, 2, 2) and weights (M,): where they are seen
-    through a blur of ``blur_px``, which where the print bends or shrinks moves what is seen.
+    through a blur of ``blur_px``, which where the print bends or shrinks moves what is seen.  Near its horizon nothing
+    is.
     """
     count, lines = len(visible), round(math.sqrt(len(visible)))
     use = np.zeros(count, dtype=np.bool_)
@@ -112,16 +123,23 @@ def _seen(stencil_px: Array, visible: Seen, height: int, width: int, spacing: fl
         b, d = (stencil_px[2 * count + n, 0] - x) / HALF_UNIT, (stencil_px[2 * count + n, 1] - y) / HALF_UNIT
         area = a * d - b * c
         if visible[n] and area > 1e-9 and 1 <= x <= width - 2 and 1 <= y <= height - 2:
-            use[n] = True
             to_template[m, 0, 0], to_template[m, 0, 1] = d / area, -b / area
             to_template[m, 1, 0], to_template[m, 1, 1] = -c / area, a / area
             at_px[m, 0], at_px[m, 1] = x, y
-            inner = _inner(visible, lines, n) if blur_px > 0 else -1
-            if inner >= 0:  # the steps on the grid that a pixel right and one down are, squared and added up
+            if blur_px > 0:
+                inner, shift_px = _inner(visible, lines, n), 0.0
+                if inner < 0:
+                    continue
+                # the steps on the grid that a pixel right and one down are, squared and added up
                 half = (blur_px / (area * spacing)) ** 2 / 2
                 xx, xy, yy = half * (b * b + d * d), -half * (a * b + c * d), half * (a * a + c * c)
                 for axis in range(2):
-                    at_px[m, axis] += _bend(stencil_px, axis, lines, inner, xx, xy, yy)
+                    bend_px = _bend(stencil_px, axis, lines, inner, xx, xy, yy)
+                    at_px[m, axis] += bend_px
+                    shift_px = max(shift_px, abs(bend_px))
+                if shift_px > MOST_SHIFT_PX:
+                    continue
+            use[n] = True
             weight[m] = min(spacing**2 * area, 1.0)
             m += 1
     return use, at_px[:m], to_template[:m], weight[:m]
@@ -147,7 +165,7 @@ def look(
 
     Points are where they are seen through a blur: it moves them where the print bends or is seen in perspective.
     """
-    lines = int(min(max(widest_px(warp) * (1 + 2 * reach) / SPACING_PX, FEWEST_LINES), most_lines))
+    lines = lines_across(warp, most_lines, reach)
     points, stencil = _grid(lines, reach)
     spacing = TEMPLATE_UNITS * (1 + 2 * reach) / (lines - 1)
     use, *seen = _seen(np.ascontiguousarray(warp(stencil)), warp.visible(points), shape[0], shape[1], spacing, blur_px)

@@ -30,23 +30,32 @@ HAIR = 1e-3
 """What is beyond a picture lies so many texels before its last one, so that there is always a next."""
 LEAST_REST = 0.02
 """Fraction of the blur's variance that is always left to the nodes."""
+TINY = 1e-9
 
 
 @compiled(MATRIX, REAL)
-def _covariance(to_template: Array, blur_px: float) -> tuple[float, float, float]:
-    """Return xx, xy and yy of a blur on the print; ``to_template`` (2, 2) takes pixels there."""
+def _axes(to_template: Array, blur_px: float) -> tuple[float, float, float, float]:
+    """Return the variances of a blur on the print along the axis it is longest in, and across; and that axis.
+
+    ``to_template`` (2, 2) takes pixels there.
+    """
     (ax, ay), (bx, by) = (to_template[0, 0], to_template[0, 1]), (to_template[1, 0], to_template[1, 1])
     square_px = blur_px * blur_px
-    return square_px * (ax * ax + ay * ay), square_px * (ax * bx + ay * by), square_px * (bx * bx + by * by)
+    cxx, cxy, cyy = square_px * (ax * ax + ay * ay), square_px * (ax * bx + ay * by), square_px * (bx * bx + by * by)
+    middle, half, area = (cxx + cyy) / 2, (cxx - cyy) / 2, square_px * (ax * by - ay * bx)
+    apart = math.sqrt(half * half + cxy * cxy)
+    longest = middle + apart
+    x, y = (half + apart, cxy) if half >= 0 else (abs(cxy), math.copysign(apart - half, cxy))
+    length = math.sqrt(x * x + y * y)
+    if length < TINY * longest:
+        return longest, longest, 1.0, 0.0
+    return longest, area * area / longest, x / length, y / length
 
 
-@compiled(REAL, REAL, REAL, REAL)
-def _factor(cxx: float, cxy: float, cyy: float, softness: float) -> tuple[float, float, float]:
-    """Return xx, yx and yy of the lower Cholesky factor of what a picture's softness leaves of a blur's covariance."""
-    lxx = math.sqrt(max(cxx - softness * softness, LEAST_REST * cxx))
-    lyx = cxy / lxx
-    least = LEAST_REST * (cxx * cyy - cxy * cxy) / cxx
-    return lxx, lyx, math.sqrt(max(cyy - softness * softness - lyx * lyx, least))
+@compiled(REAL, REAL)
+def _rest(variance: float, softness: float) -> float:
+    """Return what standard deviation a picture's softness leaves of a blur's variance."""
+    return math.sqrt(max(variance - softness * softness, LEAST_REST * variance))
 
 
 @compiled(SINGLE, INT)
@@ -76,7 +85,7 @@ def _mixed(picture: Light, row: np.uint32, column: np.uint32, down: np.float32, 
 def _sums(picture: Light, spreads: Light, nodes: Light, moments: Light) -> Light:
     """Return moments (M, K) of a picture at nodes (K, 2) around each of N points: (M, N).
 
-    ``spreads`` (5, N) are texels: x and y, and Cholesky factors xx, yx and yy that spread the nodes.  Points go in
+    ``spreads`` (6, N) are texels: x and y, and the axes along and across which the nodes are spread.  Points go in
     the inner loops, and in single precision, so that they become vector instructions.
     """
     count = spreads.shape[1]
@@ -84,7 +93,8 @@ def _sums(picture: Light, spreads: Light, nodes: Light, moments: Light) -> Light
     for k in range(len(nodes)):
         u, v = nodes[k, 0], nodes[k, 1]
         for n in range(count):
-            x, y = spreads[0, n] + spreads[2, n] * u, spreads[1, n] + spreads[3, n] * u + spreads[4, n] * v
+            x = spreads[0, n] + spreads[2, n] * u + spreads[4, n] * v
+            y = spreads[1, n] + spreads[3, n] * u + spreads[5, n] * v
             column, right = _texel(x, picture.shape[1])
             row, down = _texel(y, picture.shape[0])
             seen[n] = _mixed(picture, row, column, down, right)
@@ -99,13 +109,14 @@ def _sums(picture: Light, spreads: Light, nodes: Light, moments: Light) -> Light
 def _near_end(spreads: Light, far: float, soft: float, size: int) -> NDArray[np.int64]:
     """Return which of N points (M,) see more than the print, whose margin ends ``MARGIN`` beyond the black square.
 
-    ``spreads`` (5, N) as in ``_sums``, with nodes as ``far`` as that; ``soft`` is how far the picture, of ``size``
+    ``spreads`` (6, N) as in ``_sums``, with nodes as ``far`` as that; ``soft`` is how far the picture, of ``size``
     texels, is blurred: all in texels.
     """
     near, count = np.empty(spreads.shape[1], dtype=np.int64), 0
     low = (OUTSIDE - MARGIN) / (1 + 2 * OUTSIDE) * size + soft
     for n in range(len(near)):
-        across, down = far * spreads[2, n], far * math.sqrt(spreads[3, n] ** 2 + spreads[4, n] ** 2)
+        across = far * math.sqrt(spreads[2, n] ** 2 + spreads[4, n] ** 2)
+        down = far * math.sqrt(spreads[3, n] ** 2 + spreads[5, n] ** 2)
         x, y = spreads[0, n], spreads[1, n]
         if min(x, size - 1 - x) - across < low or min(y, size - 1 - y) - down < low:
             near[count] = n
@@ -125,18 +136,19 @@ def looks(
     nodes: Light,
     moments: Light,
 ) -> Array:
-    """Return what points (N, 2) should look like (5, N): by sums over nodes (K, 2) around each, ``moments`` (6, K).
+    """Return what points (N, 2) should look like (5, N): by sums over nodes (K, 2) around each, ``moments`` (5, K).
 
     ``brightness`` and ``beyond`` (H, W) are the print, and what is no longer the print, blurred by ``softness``, a
     texel every ``texel`` template units.
     """
     count = len(template)
-    rows, spreads = np.empty((LOOKS, count)), np.empty((5, count), dtype=np.float32)
+    rows, spreads = np.empty((LOOKS, count)), np.empty((6, count), dtype=np.float32)
     for n in range(count):
-        lxx, lyx, lyy = _factor(*_covariance(to_template[n], blur_px), softness)
+        longest, shortest, c, s = _axes(to_template[n], blur_px)
+        along, across = _rest(longest, softness) / texel, _rest(shortest, softness) / texel
         spreads[0, n] = (template[n, 0] + OUTSIDE * TEMPLATE_UNITS) / texel - 0.5
         spreads[1, n] = (template[n, 1] + OUTSIDE * TEMPLATE_UNITS) / texel - 0.5
-        spreads[2, n], spreads[3, n], spreads[4, n] = lxx / texel, lyx / texel, lyy / texel
+        spreads[2, n], spreads[3, n], spreads[4, n], spreads[5, n] = c * along, s * along, -s * across, c * across
     far = 0.0
     for k in range(len(nodes)):
         far = max(far, math.sqrt(nodes[k, 0] ** 2 + nodes[k, 1] ** 2))
@@ -146,14 +158,12 @@ def looks(
         rows[AROUND, near] = _sums(beyond, np.ascontiguousarray(spreads[:, near]), nodes, moments[:1])[0]
     sums = _sums(brightness, spreads, nodes, moments)
     for n in range(count):
-        cxx, cxy, cyy = _covariance(to_template[n], blur_px)
-        lxx, lyx, lyy = _factor(cxx, cxy, cyy, softness)
-        dxx, dyx, dyy = 1 / lxx, -lyx / (lxx * lyy), 1 / lyy
-        x, y = dxx * sums[1, n] + dyx * sums[2, n], dyy * sums[2, n]  # derivatives on the print
-        mxx, mxy = dxx * dxx * cxx, dxx * (dyx * cxx + dyy * cxy)
-        myy = dyx * dyx * cxx + 2 * dyx * dyy * cxy + dyy * dyy * cyy
+        longest, shortest, c, s = _axes(to_template[n], blur_px)
+        along, across = _rest(longest, softness), _rest(shortest, softness)
+        ahead, aside = sums[1, n] / along, sums[2, n] / across  # derivatives on the print, along the axes
+        x, y = c * ahead - s * aside, s * ahead + c * aside
         rows[MEAN, n] = sums[0, n]
         rows[BY_X, n] = x * to_template[n, 0, 0] + y * to_template[n, 1, 0]
         rows[BY_Y, n] = x * to_template[n, 0, 1] + y * to_template[n, 1, 1]
-        rows[BY_BLUR, n] = mxx * sums[3, n] + 2 * mxy * sums[4, n] + myy * sums[5, n]
+        rows[BY_BLUR, n] = longest / along**2 * sums[3, n] + shortest / across**2 * sums[4, n]
     return rows

@@ -32,7 +32,7 @@ from astratag.geometry import (
     layer_points,
     square,
 )
-from astratag.grid import LAYER_REACH, MOST_AT_A_GLANCE, MOST_LINES, Look, look, widest_px
+from astratag.grid import FINE_LINES, LAYER_REACH, MOST_AT_A_GLANCE, MOST_LINES, Look, lines_across, look, widest_px
 from astratag.looks import AROUND, BY_BLUR, BY_X, BY_Y, MEAN, OUTSIDE, looks
 from astratag.normal import left_over
 from astratag.steps import contrast, step, values
@@ -51,10 +51,14 @@ LABELS = FIRST_CELL + CELLS
 OF_COMMON = 3 + FIRST_CELL
 """What all identities have in common: light that varies in a plane, and the labels that are no cells."""
 KEPT_PICTURES = 64
-NODES, MANY_NODES = 24, 64
-"""Points that stand for the Gaussian a pixel sees through: of a picture blurred beforehand, and of a sharp one."""
+FEWER_NODES, MANY_NODES = 24, 64
+"""Points that stand for the Gaussian a pixel sees through, of a sharp picture; at a glance, and well."""
 WIDE = 1.8
 """Where, at a slant, what is left of the blur is so many times the picture's softness one way, two rings are coarse."""
+NODES_ALONG, NODES_ACROSS, ENDS = (9, 17, 33), 3, 3.0
+"""Nodes in rows along the way a blur is longest, evenly spaced to so many standard deviations, and rows of them."""
+APART = 1.5
+"""How far apart these are at most, as far as there are so many, over the picture's softness."""
 TEXELS = 4.0
 """Texels to a picture's blur."""
 SIGMA_FLOOR_PX = 0.006
@@ -123,13 +127,13 @@ def _nodes(count: int) -> Array:
     return np.ascontiguousarray(np.linalg.solve(np.linalg.cholesky(nodes.T @ nodes / count), nodes.T).T)
 
 
-_MANY_NODES, _FEWER_NODES = _nodes(MANY_NODES), _nodes(NODES)
+_MANY_NODES, _FEWER_NODES = _nodes(MANY_NODES), _nodes(FEWER_NODES)
 
 
 class Nodes(NamedTuple):
-    """Points (K, 2) that stand for a standard normal distribution in the plane, and ``moments`` (6, K) over them.
+    """Points (K, 2) that stand for a standard normal distribution in the plane, and ``moments`` (5, K) over them.
 
-    The moments take brightnesses there to their mean, and by parts to its first and second derivatives.
+    The moments take brightnesses there to their mean, and by parts to its first and second derivatives by x and y.
     """
 
     places: Light
@@ -139,7 +143,7 @@ class Nodes(NamedTuple):
 def _weighted(places: Array, weights: Array) -> Nodes:
     """Return nodes of given weights (K,), which add up to one."""
     x, y = places.T
-    moments = np.stack([x**0, x, y, x * x - 1, x * y, y * y - 1]) * weights
+    moments = np.stack([x**0, x, y, x * x - 1, y * y - 1]) * weights
     return Nodes(places.astype(np.float32), moments.astype(np.float32))
 
 
@@ -151,7 +155,19 @@ def _rings() -> Nodes:
     return _weighted(places.reshape(-1, 2), np.repeat(weights / 6, 6))
 
 
-_FEW, _SPREAD = _rings(), _weighted(_nodes(NODES), np.full(NODES, 1 / NODES))
+def _rows(count: int) -> Nodes:
+    """Return rows of so many nodes: evenly spaced along x, where a blur is long, and by Gauss-Hermite across."""
+    along = np.linspace(-ENDS, ENDS, count)
+    across, share = np.polynomial.hermite_e.hermegauss(NODES_ACROSS)
+    density = np.exp(-0.5 * along**2)
+    density /= density.sum()
+    along /= np.sqrt(density @ along**2)
+    weights = np.outer(density, share / share.sum())
+    places = np.stack(np.meshgrid(along, across, indexing="ij"), axis=2)
+    return _weighted(places.reshape(-1, 2), weights.ravel())
+
+
+_FEW, _ROWS = _rings(), tuple(_rows(count) for count in NODES_ALONG)
 
 
 class Picture(NamedTuple):
@@ -185,9 +201,18 @@ def expected(seen: Look, picture: Picture, blur_px: float) -> Expected:
 
 def looks_of(seen: Look, picture: Picture, blur_px: float) -> Array:
     """Return the same as rows (5, N), in the order of ``steps``."""
-    rest = (blur_px * seen.units[1]) ** 2 - picture.softness**2
-    nodes = _FEW if rest < (WIDE * picture.softness) ** 2 else _SPREAD
-    return looks(seen.template, seen.to_template, *picture, blur_px, *nodes)
+    return looks(seen.template, seen.to_template, *picture, blur_px, *_nodes_for(seen, picture, blur_px))
+
+
+def _nodes_for(seen: Look, picture: Picture, blur_px: float) -> Nodes:
+    """Return as many nodes as it takes to sum what the picture's softness leaves of a blur."""
+    rest = np.sqrt(max((blur_px * seen.units[1]) ** 2 - picture.softness**2, 0.0)) / max(picture.softness, picture.texel)
+    if rest < WIDE:
+        return _FEW
+    enough = (
+        rows for count, rows in zip(NODES_ALONG, _ROWS, strict=True) if APART * (count - 1) >= 2 * ENDS * rest
+    )
+    return next(enough, _ROWS[-1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -325,23 +350,35 @@ class Synthesis:
         """
         alignment = None
         for taken in range(steps):
-            seen = look(warp, light.shape, blur_px=blur_px)
-            if seen is None:
+            alignment = self._step(light, warp, marker_id, blur_px, MOST_LINES)
+            if alignment is None or (taken == 1 and alignment.correlation < hopeless):
                 return None
-            shown = looks_of(seen, self._picture(marker_id, seen.softness(blur_px)), blur_px)
-            J = np.ascontiguousarray(warp.jacobian(seen.template))
-            x, covariance, apart, correlation, moved_px = step(
-                light, seen.at_px, seen.template, seen.weight, shown, J, warp.step_sigma()
-            )
-            if apart <= 0 or (taken == 1 and correlation < hopeless):
-                return None
-            warp = warp.stepped(x[:-1])
-            blur_px = min(max(blur_px * math.exp(x[-1]), LEAST_BLUR_PX), MOST_BLUR_PX)
-            slant = seen.units[1] / max(seen.units[0], TINY)
-            alignment = Alignment(warp, blur_px, correlation, covariance[:-1, :-1], moved_px, slant)
-            if moved_px < settled_px:
+            warp, blur_px = alignment.warp, alignment.blur_px
+            if alignment.moved_px < settled_px:
                 break
         return alignment
+
+    def refined(self, light: Light, aligned: Alignment[W], marker_id: int) -> Alignment[W]:
+        """Return an alignment after one more step on a finer grid, if it looks so large that there is one."""
+        if lines_across(aligned.warp, FINE_LINES) <= MOST_LINES:
+            return aligned
+        return self._step(light, aligned.warp, marker_id, aligned.blur_px, FINE_LINES) or aligned
+
+    def _step(self, light: Light, warp: W, marker_id: int, blur_px: float, most_lines: int) -> Alignment[W] | None:
+        """Return warp and blur after a Gauss-Newton step; None when the print is out of view or does not look so."""
+        seen = look(warp, light.shape, most_lines=most_lines, blur_px=blur_px)
+        if seen is None:
+            return None
+        shown = looks_of(seen, self._picture(marker_id, seen.softness(blur_px)), blur_px)
+        J = np.ascontiguousarray(warp.jacobian(seen.template))
+        x, covariance, apart, correlation, moved_px = step(
+            light, seen.at_px, seen.template, seen.weight, shown, J, warp.step_sigma()
+        )
+        if apart <= 0:
+            return None
+        blur_px = min(max(blur_px * math.exp(x[-1]), LEAST_BLUR_PX), MOST_BLUR_PX)
+        slant = seen.units[1] / max(seen.units[0], TINY)
+        return Alignment(warp.stepped(x[:-1]), blur_px, correlation, covariance[:-1, :-1], moved_px, slant)
 
     def _picture(self, marker_id: int, softness: float) -> Picture:
         return _picture(self._dictionary.signature(marker_id).tobytes(), softness)
