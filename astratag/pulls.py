@@ -16,6 +16,8 @@ from astratag.locate import LEAST_LENS_PX, SMOOTHING_PX
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+INTERPOLATION_PX2 = 1 / 6
+"""How far interpolation between pixels smooths their noise, as a variance."""
 SHARP_REACH_PX = 4.0
 """An edge this far from its neighbours is sharp; nearer, they pull."""
 PULL_PX, PULL_FLOOR_PX = 0.023, 0.0005
@@ -117,14 +119,15 @@ def _known(
 
 
 @compiled(REAL, REAL)
-def _quieter(lens_px: float, smoothing_px: float) -> float:
+def quieter(lens_px: float, smoothing_px: float) -> float:
     """Return how much less noise moves an edge through a filter than through the narrowest, both wide as the lens.
 
-    The second derivative through a filter is as noisy as the power of -5/2 of its width, and crosses zero as steeply
-    as that of -3 of all blur.
+    The second derivative through a filter is as noisy as the power of -5/2 of its width, interpolation included, and
+    crosses zero as steeply as that of -3 of all blur.
     """
-    squared = (lens_px**2 + SMOOTHING_PX**2) / (lens_px**2 + smoothing_px**2)
-    return squared**1.5 * (smoothing_px / SMOOTHING_PX) ** 2.5
+    blur = (lens_px**2 + SMOOTHING_PX**2) / (lens_px**2 + smoothing_px**2)
+    filtered = (smoothing_px**2 + INTERPOLATION_PX2) / (SMOOTHING_PX**2 + INTERPOLATION_PX2)
+    return float(blur**1.5 * filtered**1.25)
 
 
 @compiled(VECTOR, VECTOR, FLAG_MATRIX)
@@ -161,5 +164,5 @@ def pulls_on(
     blur_px = np.hypot(lens_px, smoothing_px)
     found = pull(beside, blur_px, within_reach(reach_px, blur_px, use), offset_px)
     for e in range(len(blur_px)):
-        found.curvature[e] *= _quieter(lens_px, smoothing_px[e])
+        found.curvature[e] *= quieter(lens_px, smoothing_px[e])
     return _known(found.px, found.curvature, blur_px, edges, margin_px, clipped_px)

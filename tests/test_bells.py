@@ -22,13 +22,14 @@ NEAR = crossings(CODE.tobytes())
 POINTS = EDGE_POINTS.shape[:2]
 EVERY_EDGE, EVERY_POINT, NOTHING = np.arange(len(EDGES)), np.ones(POINTS, dtype=bool), np.zeros(POINTS)
 BLUR_PX = 1.15
+BLURS = np.full(len(EDGES), BLUR_PX)
 SEED = 11
 
 
 def beside(unit_px: float, lean: float = 0.0, squeeze: float = 1.0, along_px: float = BLUR_PX) -> Array:
     """Return what is around all edges where they look alike; ``along_px`` is what they are blurred by lengthwise."""
     look = (np.full(POINTS, value) for value in (unit_px, 0.0, lean, squeeze, 1e3))
-    return around(*NEAR, EVERY_EDGE, *look, NOTHING, BLUR_PX, np.full(len(EDGES), along_px), EVERY_POINT)
+    return around(*NEAR, EVERY_EDGE, *look, NOTHING, BLURS, np.full(len(EDGES), along_px), EVERY_POINT)
 
 
 def top_of_samples(slopes: Array) -> float:
@@ -84,7 +85,7 @@ def test_pulls_are_what_a_blurred_picture_of_the_print_shows(tilt_deg: float, al
             for point in chosen:
                 seen_px[edge, point] = steepest(edge, point, px_of_unit, along_px)
             look = beside(unit_px, lean, unit_px / units_along_px, along_px)
-            found = pull(look, BLUR_PX, EVERY_POINT, seen_px).px
+            found = pull(look, BLURS, EVERY_POINT, seen_px).px
             errors += [
                 found[edge, point] - seen_px[edge, point] for point in chosen if not np.isnan(found[edge, point])
             ]
@@ -94,10 +95,10 @@ def test_pulls_are_what_a_blurred_picture_of_the_print_shows(tilt_deg: float, al
 
 
 def test_nothing_pulls_from_far_away() -> None:
-    found = pull(beside(10.0), 1.2, EVERY_POINT, NOTHING)
+    found = pull(beside(10.0), BLURS, EVERY_POINT, NOTHING)
     np.testing.assert_allclose(found.px, 0, atol=1e-9)
     np.testing.assert_allclose(found.curvature, 1, atol=1e-9)
-    np.testing.assert_allclose(narrowing(beside(10.0), 1.2, EVERY_POINT), 1, atol=1e-6)
+    np.testing.assert_allclose(narrowing(beside(10.0), BLURS, EVERY_POINT), 1, atol=1e-6)
 
 
 def test_what_is_behind_a_thin_margin_pulls_like_an_edge() -> None:
@@ -105,12 +106,12 @@ def test_what_is_behind_a_thin_margin_pulls_like_an_edge() -> None:
     x = np.arange(-3, 4) * STEP_PX
     bar_px = top_of_samples(norm.pdf(x, scale=BLUR_PX) - norm.pdf(x - 2.5, scale=BLUR_PX))
     look = (np.full(POINTS, value) for value in (10.0, 0.0, 0.0, 1.0, 2.5))
-    dark = around(*NEAR, EVERY_EDGE, *look, np.full(POINTS, -1.0), BLUR_PX, np.full(len(EDGES), BLUR_PX), EVERY_POINT)
-    found = pull(dark, BLUR_PX, EVERY_POINT, np.full(POINTS, bar_px))
+    dark = around(*NEAR, EVERY_EDGE, *look, np.full(POINTS, -1.0), BLURS, BLURS, EVERY_POINT)
+    found = pull(dark, BLURS, EVERY_POINT, np.full(POINTS, bar_px))
     assert bar_px < -0.05
     np.testing.assert_allclose(found.px[:4], bar_px, atol=0.01)
 
 
 def test_what_is_around_a_print_of_unknown_code_is_not_known() -> None:
     look = (np.full(POINTS, value) for value in (1.0, 0.0, 0.0, 1.0, 1e3))
-    assert len(around(*UNKNOWN, EVERY_EDGE, *look, NOTHING, BLUR_PX, np.full(len(EDGES), BLUR_PX), EVERY_POINT)) == 0
+    assert len(around(*UNKNOWN, EVERY_EDGE, *look, NOTHING, BLURS, BLURS, EVERY_POINT)) == 0

@@ -74,14 +74,15 @@ def looks(warp: FittedWarp, blur_px: float, softness: float | None = None) -> Ex
     return expected(seen, _picture(DICTIONARY.signature(7).tobytes(), soft), blur_px)
 
 
-@pytest.mark.parametrize(("side_px", "tilt_deg"), [(14, 0.0), (20, 60.0), (60, 30.0)])
+@pytest.mark.parametrize(("side_px", "tilt_deg"), [(14, 0.0), (20, 60.0), (60, 30.0), (120, 78.0)])
 def test_what_is_expected_is_the_mean_of_the_artwork_under_the_blur(
     side_px: float, tilt_deg: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Few nodes on a soft picture give what thousands give on a sharp one, to some hundredths of the contrast."""
     warp = PoseWarp(CAMERA, SIDE_M, Flat(), tumbled(side_px, 3, tilt_deg))
     few = looks(warp, BLUR_PX)
-    monkeypatch.setattr("astratag.synthesis._SPREAD", _weighted(_nodes(3000), np.full(3000, 1 / 3000)))
+    thousands = _weighted(_nodes(3000), np.full(3000, 1 / 3000))
+    monkeypatch.setattr("astratag.synthesis._nodes_for", lambda *_: thousands)
     many = looks(warp, BLUR_PX, softness=0.0)
     assert np.sqrt(np.mean((few.mean - many.mean) ** 2)) < 0.02
     assert np.abs(few.beyond - many.beyond).max() < 0.08
