@@ -318,7 +318,10 @@ class Confirmer(Describer):
         seen = match(self._synthesis, view.lit, rough, PIXEL_BLUR, self._accept_of_pixels)
         if seen is None:
             return None
-        return self._described_by_pixels(view, seen.marker_id, seen.alignment, seen.layer, seen.correlation, "planar")
+        detection = self._described_by_pixels(
+            view, seen.marker_id, seen.alignment, seen.layer, seen.correlation, "planar"
+        )
+        return None if detection is None else self.polished(view, detection, np.inf, Flat())
 
 
 def _inside_layer(warp: FittedWarp, layer: Layer, points: Array) -> Array:

@@ -56,8 +56,6 @@ FOUND_PX, POLISHED_PX, LEAST_POLISHED = 56.0, 90.0, 0.95
 At 32 to 48 pixels corners are twice as exact so, at 60 by a half, at 85 by a tenth.  What was just found is measured so
 only where that is worth most, for it takes as long again as finding it; what is tracked, up to the larger size.
 """
-UNKNOWN_BEND = 2.0
-"""By so much more a pose varies that all pixels of a print tell together with its bend: measured past 70 degrees."""
 CELLS_WITHIN = np.array([layer_points(square(BORDER_UNITS, TEMPLATE_UNITS - BORDER_UNITS), layer) for layer in LAYERS])
 CELLS_WITHIN.flags.writeable = False
 """The corners (3, 4, 2) of the squares that hold the layers' cells, template units."""
@@ -209,8 +207,6 @@ class Describer:
         layers = (LayerDetection(layer, square_px, aligned.sigma_px(SQUARES[layer])),)
         is_pose = isinstance(aligned.warp, PoseWarp | CylinderWarp)
         covariance = aligned.cautious_covariance[:6, :6] if is_pose else None
-        if covariance is not None and isinstance(aligned.warp, CylinderWarp):
-            covariance = UNKNOWN_BEND * covariance
         reading = Reading(marker_id, 0, correlation, wrong, cells=cells)
         planar = before.planar_poses if before is not None and is_pose else ()
         return self._described(view, reading, aligned.warp, layers, method, covariance, planar)
