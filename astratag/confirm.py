@@ -30,7 +30,7 @@ from astratag.curved import (
     seen_whole,
 )
 from astratag.cylinder import CylinderWarp
-from astratag.describe import FOUND_PX, LEAST_POLISHED, PIXEL_BLUR, WARPS, Describer, inside, lead
+from astratag.describe import LEAST_POLISHED, PIXEL_BLUR, POLISHED_PX, WARPS, Describer, inside, lead
 from astratag.detection import Detection, LayerDetection
 from astratag.fit import follows_all_sides
 from astratag.geometry import LAYERS, SQUARES, Layer, layer_points
@@ -230,7 +230,7 @@ class Confirmer(Describer):
         if not detection.layers and not follows_all_sides(fit):
             return None  # nothing says where it is
         surface = fit.warp.surface if isinstance(fit.warp, PoseWarp) else None
-        return self.polished(view, self.with_other_pose(view, detection, fit), FOUND_PX, surface)
+        return self.polished(view, self.with_other_pose(view, detection, fit), POLISHED_PX, surface)
 
     def _as_bent_as_seen(self, view: View, marker_id: int, fit: Fit, likeness: float) -> Fit:
         """Return the simplest fit that explains a print on an unknown surface: a plane's, a cylinder's, or as it was.

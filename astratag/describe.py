@@ -50,11 +50,11 @@ PIXEL_BLUR = 0.95
 """Blur from which squares are matched, pixels: a good lens's, and what sampling between pixels adds."""
 POLISHED_TO_PX = 0.08
 """The step after one that moved a print by less would move it by a hundredth of a pixel."""
-FOUND_PX, POLISHED_PX, LEAST_POLISHED = 56.0, 90.0, 0.95
+POLISHED_PX, LEAST_POLISHED = 56.0, 0.95
 """Markers that look smaller are measured by all their pixels, not by their edges, where these look right.
 
-At 32 to 48 pixels corners are twice as exact so, at 60 by a half, at 85 by a tenth.  What was just found is measured so
-only where that is worth most, for it takes as long again as finding it; what is tracked, up to the larger size.
+At 48 pixels poses are twice as exact so, at 60 by a half; it takes as long again as finding them, and from 80 pixels on
+so many points of the print would have to be looked at that edges are better.
 """
 CELLS_WITHIN = np.array([layer_points(square(BORDER_UNITS, TEMPLATE_UNITS - BORDER_UNITS), layer) for layer in LAYERS])
 CELLS_WITHIN.flags.writeable = False

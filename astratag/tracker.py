@@ -32,6 +32,8 @@ STEADY_PX, TRACK_PX = 2.0, 6.0
 """How far from its prediction an edge may be when the marker moves on as before, and when it does not."""
 OUTER_EDGES = ALL_EDGES[EDGE_LAYER < 2]
 """Of a marker that moves on as before: the innermost square adds less than a hundredth to what these tell."""
+MATCHED_PX = 90.0
+"""Markers that look smaller, and whose edges cannot be followed, are looked for by all their pixels."""
 CERTAIN = 0.9999
 """Probability of the other planar pose from which a tracked marker is taken to be there instead."""
 LEAST_BOX_PX = 16
@@ -147,7 +149,7 @@ class Tracker:
         """Return a tracked marker that is too small or blurred for its edges to be followed."""
         for T_cam_marker in track.predictions:
             warp = self._predicted(view, track.marker_id, T_cam_marker)
-            if layer_side_px(warp, 0) < POLISHED_PX:
+            if layer_side_px(warp, 0) < MATCHED_PX:
                 detection = self.detector.match_near(view, track.marker_id, warp, "tracked")
                 if detection is not None:
                     return detection
