@@ -35,6 +35,7 @@ from astratag.neighbours import UNKNOWN, Crossings
 from astratag.normal import dot, factored, inverse, ranked
 from astratag.pulls import SHARP_REACH_PX, pulls_on, within_reach
 from astratag.sampling import Light
+from astratag.shading import shading
 from astratag.warp import FittedWarp
 
 Array = NDArray[np.float64]
@@ -204,6 +205,21 @@ def _measured(
     )
     if _on_all_sides(edges, use & ~known.lost):
         use &= ~known.lost
+    shaded_px = np.zeros(use.shape)
+    if len(places) > 0:
+        shaded_px = shading(
+            gray,
+            of_gray,
+            edges,
+            seen.predicted_px,
+            seen.normal,
+            seen.margin_px,
+            seen.unit_px,
+            seen.lean,
+            seen.lens_px,
+            use,
+            blur_px,
+        )
     count, i, sharp = np.count_nonzero(use), 0, 0
     used, points = np.empty(count, np.int64), np.empty((6, count))
     places_px, normal = np.empty((2, use.size)), np.empty((2, use.size))
@@ -211,7 +227,7 @@ def _measured(
         share = min(1.0, seen.length_px[e] / (POINTS_PER_EDGE * CORRELATION_LENGTH_PX))
         quieter = np.sqrt(float(seen.rows[e]))
         for m in range(POINTS_PER_EDGE):
-            k, offset_px = e * POINTS_PER_EDGE + m, seen.offset_px[e, m] - known.pull_px[e, m]
+            k, offset_px = e * POINTS_PER_EDGE + m, seen.offset_px[e, m] - known.pull_px[e, m] - shaded_px[e, m]
             for axis in range(2):
                 normal[axis, k] = seen.normal[axis, e, m]
                 places_px[axis, k] = seen.predicted_px[axis, e, m] + offset_px * normal[axis, k]
