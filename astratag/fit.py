@@ -30,7 +30,7 @@ from astratag.compiled import (
     compiled,
 )
 from astratag.edges import POINTS_PER_EDGE, template_of
-from astratag.locate import locate
+from astratag.locate import ROW_PX, locate
 from astratag.neighbours import UNKNOWN, Crossings
 from astratag.normal import dot, factored, inverse, ranked
 from astratag.pulls import SHARP_REACH_PX, pulls_on, within_reach
@@ -49,7 +49,7 @@ NOISE_FLOOR_PX = 0.01
 """No edge point is believed to be better than this."""
 FIRST_SIGMA_PX = 0.3
 """What the noise is taken for at first: so much that all points count alike."""
-CORRELATION_LENGTH_PX = 1.6
+CORRELATION_LENGTH_PX = ROW_PX
 """Edge points nearer than this along an edge share their noise (blur, JPEG blocks)."""
 NUISANCE_SIGMA = np.array([BIAS_SIGMA_PX, 0.15, 0.03])
 """Prior standard deviations of the edge bias, of how wrong what is known of all pulls is, as a fraction of them, and of
@@ -205,9 +205,9 @@ def _measured(
     )
     if _on_all_sides(edges, use & ~known.lost):
         use &= ~known.lost
-    shaded_px = np.zeros(use.shape)
+    shaded_px, wrong_px = np.zeros(use.shape), np.zeros(use.shape)
     if len(places) > 0:
-        shaded_px = shading(
+        shaded_px, wrong_px = shading(
             gray,
             of_gray,
             edges,
@@ -233,7 +233,8 @@ def _measured(
                 places_px[axis, k] = seen.predicted_px[axis, e, m] + offset_px * normal[axis, k]
             if use[e, m]:
                 used[i], points[0, i], points[1, i], points[2, i] = k, offset_px, known.keen[e, m] * quieter, share
-                points[3, i], points[4, i] = known.variance[e, m], known.growth[e, m]
+                shading_px2 = POINTS_PER_EDGE * wrong_px[e, m] ** 2  # all of an edge are off alike
+                points[3, i], points[4, i] = known.variance[e, m] + shading_px2, known.growth[e, m]
                 points[5, i] = min(abs(known.pull_px[e, m]) / WHOLLY_PX, 1.0)
                 i += 1
         if seen.reach_px[e] >= SHARP_REACH_PX:

@@ -20,7 +20,7 @@ Posed = Callable[[FittedWarp], PoseWarp | None]
 ALL_EDGES = np.arange(len(EDGES))
 SETTLE_PX = 2.0
 """How far from its prediction an edge is looked for once the fit has settled."""
-SETTLED_PX, MAX_SETTLING = 0.5, 4
+SETTLED_PX, MAX_SETTLING = 0.2, 4
 """A fit that moves no edge further than this has settled."""
 MAX_SEARCH_PX = 12.0
 CURVED_GAIN = 0.6

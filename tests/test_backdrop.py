@@ -26,7 +26,7 @@ def seen(behind: float, margin_px: float, edge: int = 0) -> np.ndarray:
     predicted = np.stack([np.full((1, POINTS_PER_EDGE), EDGE_PX), rows[None]])
     normal = np.stack([np.ones((1, POINTS_PER_EDGE)), np.zeros((1, POINTS_PER_EDGE))])
     margins = np.full((1, POINTS_PER_EDGE), margin_px)
-    return backdrop(gray, LINEAR, np.array([edge]), predicted, normal, margins, BLUR_PX)
+    return backdrop(gray, LINEAR, np.array([edge]), predicted, normal, margins, BLUR_PX, np.array([BLUR_PX]))
 
 
 @pytest.mark.parametrize("margin_px", [1.8, 2.5, 4.0])
