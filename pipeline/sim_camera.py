@@ -36,8 +36,9 @@ from pipeline.texture import PRINT_UNITS, Image, print_coverage
 
 Array = NDArray[np.float64]
 
-GRID_PX = 4 * FINER
-"""Rays are cast at every so many fine pixels and interpolated: 0.002 px off for a marker tilted by 20 degrees."""
+GRID_PX = 4
+"""Rays are cast at every so many fine pixels and interpolated: less than 0.001 px off for a marker tilted by 20 degrees,
+0.01 px where a cylinder is turned by 60."""
 ADC_MAX = 4095
 NOISE_MARGIN_PX = 97
 """Noise is a stored field, read at a random place of so many."""
@@ -212,7 +213,7 @@ class SimCamera:
 def _grid_rays(camera: Camera) -> tuple[Array, Array, Array]:
     """Return x/z and y/z of rays (R, C, 2) on a grid around the picture, and their change a pixel right and down.
 
-    Cell k stands for pixels 8 (k - 1) to 8 (k - 1) + 7: its ray goes through their middle.
+    Cell k stands for pixels 4 (k - 1) to 4 (k - 1) + 3: its ray goes through their middle.
     """
     rows, columns = (
         (np.arange(-(-n // GRID_PX) + 2) - 1.0) * GRID_PX + (GRID_PX - 1) / 2 for n in (camera.height, camera.width)
