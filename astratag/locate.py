@@ -312,7 +312,7 @@ def _judged(
                     alone[e, m] = True
                     slopes_beside += beside[e, m]
                     squared += rise[e, m] * rise[e, m]
-            # slopes are bells; a Gaussian's logarithm is a parabola, whose width its values at the top and beside it tell
+            # slopes are bells: a Gaussian's logarithm is a parabola, whose width its top and what is beside it tell
             ratio = min(max(slopes_beside / max(squared, 1e-9), LOW_RATIO), HIGH_RATIO)
             lens_px2 += squared * (STEP_PX**2 / -np.log(ratio) - smoothing_px[e] ** 2)
             in_all += squared
@@ -333,19 +333,17 @@ def _seen(
 ) -> tuple[Array, Mask, Mask, Mask, float, Array]:
     """Return where edges are found through filters of standard deviation ``smoothing_px`` (E,): most of ``Edges``."""
     _, edges, points = predicted_px.shape
-    halves = np.ceil((search_px + 3 * smoothing_px) / STEP_PX).astype(np.int64)
-    in_view = _in_view(predicted_px, facing, halves * STEP_PX, gray.shape[0], gray.shape[1])
+    halves = np.ceil((search_px + 3 * smoothing_px) / STEP_PX)
+    in_view = _in_view(predicted_px, facing, STEP_PX * halves, gray.shape[0], gray.shape[1])
     ink, paper = np.empty((edges, points)), np.empty((edges, points))
     offset_px, rise, beside = np.empty((edges, points)), np.empty((edges, points)), np.empty((edges, points))
     for e in range(edges):
-        half, limit_px = halves[e], WITHIN_REACH * reach_px[e]
+        half, limit_px = int(halves[e]), WITHIN_REACH * reach_px[e]
         within_px = min(search_px, half * STEP_PX - 3 * smoothing_px[e] + BESIDE_PX)
         kept = int(((limit_px if limit_px < within_px else within_px) + 1e-9) / STEP_PX)
         profiles = _profiles(gray, of_gray, predicted_px, normal, e, half, rows[e])
         ink[e], paper[e] = _extremes(profiles)
-        offset_px[e], rise[e], beside[e] = _steepest_rise(
-            _slopes(profiles, _derivative(smoothing_px[e]), kept + 1)
-        )
+        offset_px[e], rise[e], beside[e] = _steepest_rise(_slopes(profiles, _derivative(smoothing_px[e]), kept + 1))
     found, alone, lens_px, clipped_px = _judged(ink, paper, offset_px, rise, beside, in_view, reach_px, smoothing_px)
     for e in range(edges):
         for m in range(points):

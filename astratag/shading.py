@@ -106,7 +106,7 @@ def shading(
     use: Mask,
     blur_px: Array,
 ) -> tuple[Array, Array]:
-    """Return how far towards the paper (E, M) the steepest places of E ``edges`` lie from them, and how wrong that may be.
+    """Return how far towards the paper the steepest places of E ``edges`` lie, and how wrong that may be (E, M).
 
     Light that grows by a share a pixel makes the slope of an edge, a bell, grow as well: its top moves by that share of
     the variance of all blur, ``blur_px`` (E,) squared.  How the edges lie are fields of ``locate.Edges``; the paper

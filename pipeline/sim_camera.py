@@ -37,8 +37,8 @@ from pipeline.texture import PRINT_UNITS, Image, print_coverage
 Array = NDArray[np.float64]
 
 GRID_PX = 4
-"""Rays are cast at every so many fine pixels and interpolated: less than 0.001 px off for a marker tilted by 20 degrees,
-0.01 px where a cylinder is turned by 60."""
+"""Rays are cast at every so many fine pixels and interpolated: 0.001 px off for a marker tilted by 20 degrees, 0.01 px
+where a cylinder is turned by 60."""
 ADC_MAX = 4095
 NOISE_MARGIN_PX = 97
 """Noise is a stored field, read at a random place of so many."""
@@ -118,7 +118,8 @@ class SimCamera:
     """A calibrated camera that sees the markers of a mission, always with the same noise for the same seed."""
 
     def __init__(self, camera: Camera, mission: Mission, *, light: LightSection, sensor: SensorSection, seed: int):
-        self._camera, self._fine, self._light, self._sensor, self._seed = camera, finer_camera(camera), light, sensor, seed
+        self._camera, self._light, self._sensor, self._seed = camera, light, sensor, seed
+        self._fine = finer_camera(camera)
         dictionary = load_dictionary(mission.dictionary)
         self._bodies = [
             (

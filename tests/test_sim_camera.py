@@ -62,7 +62,7 @@ def test_against_the_exact_renderer(T: np.ndarray):
     signature = load_dictionary("astratag20").signature(7)
     white = float(srgb_from_linear(np.float32(EVEN.sky)) * 255)
     exact = render_marker(
-        CAMERA, T, signature=signature, side_m=SIDE_M, blur_px=PLAIN.blur_px, noise_sigma=0, background=white, samples=64
+        CAMERA, T, signature=signature, side_m=SIDE_M, blur_px=1.0, noise_sigma=0, background=white, samples=64
     ).astype(float)
     fast = seen(T, sensor=PLAIN.model_copy(update={"rays": 28}))
     assert np.abs(fast - exact).mean() < 1.0

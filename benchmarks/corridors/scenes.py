@@ -144,7 +144,8 @@ def picture_at(corridor: Corridor, scene: Scene, t_s: float) -> bytes:
     """Return the picture taken with mid-exposure at ``t_s``."""
     T_marker_target = inverse(corridor.mission.markers[0].T_target_marker.matrix())
     instants_s = t_s + EXPOSURE_S * ((np.arange(RAYS) + 0.5) / RAYS - 0.5)
-    light = scene.light(finer_camera(CAMERA), [corridor.approach.at(float(t)).T_a_b @ T_marker_target for t in instants_s])
+    poses = [corridor.approach.at(float(t)).T_a_b @ T_marker_target for t in instants_s]
+    light = scene.light(finer_camera(CAMERA), poses)
     rng = np.random.default_rng((corridor.seed, round(t_s * 1e6)))
     picture = Sensor().expose(light, CAMERA, range_m=corridor.approach.at(t_s).T_a_b[2, 3], rng=rng)
     quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
