@@ -80,8 +80,8 @@ def around(
     that ``COSINE`` and ``SINE``; along the other edge, from where the point is beside it, it is so many pixels to its
     ``BEGIN`` and ``FINISH``.  The first without a change ends the list.  Those within reach of ``blur_px`` (E,) are
     listed, the edge's own among them, and the end of the margin; nothing when no crossings are known.  These are the
-    fields of ``neighbours.Crossings``, how edges look those of ``locate.Edges``; what changes at the end of the margin is the
-    ``backdrop`` (E, M).
+    fields of ``neighbours.Crossings``, how edges look those of ``locate.Edges``; what changes at the end of the margin
+    is the ``backdrop`` (E, M).
     """
     listed = len(places) // len(LEANS)
     seen = np.zeros((len(edges) if listed else 0, use.shape[1], MOST_BELLS, 6))
@@ -172,8 +172,8 @@ def pull(beside: Array, blur_px: Array, use: Mask, offset_px: Array) -> Pull:
     """Return what neighbours, as ``around`` gives them, do to the points to ``use`` (E, M).
 
     All is blurred by standard deviations of ``blur_px`` (E,).  Newton's method on the sum of bells; then, as where
-    points were found, ``offset_px`` (E, M), the top of the parabola through the three highest samples: between lopsided ones
-    it lies elsewhere.
+    points were found, ``offset_px`` (E, M), the top of the parabola through the three highest samples: between lopsided
+    ones it lies elsewhere.
     """
     pull_px, roundness, bells = np.zeros(use.shape), np.ones(use.shape), np.empty((MOST_BELLS, 6))
     for e in range(use.shape[0]):

@@ -16,9 +16,9 @@ SAME_SQUARE = 0.04
 """Squares whose centres and sides differ by less than this fraction are one square found twice."""
 BETTER = 0.03
 """A square that was looked at is looked at again where it reads so much better."""
-LEAST_UNITS, UNITS_A_PIXEL, MOST_UNITS, SHARE_OF_FLAT = 6_600, 0.02425, 15_000, 0.75
+LEAST_UNITS, UNITS_A_PIXEL, MOST_UNITS, SHARE_OF_FLAT = 7_600, 0.02425, 16_000, 0.7
 """What one image is worth whatever its size, and more for each pixel, up to a limit: what the hardest markers of the
-benchmark take, which at 640x480 is 14 000; and the share of that where every marker is known to be flat.  A plain one
+benchmark take, which at 640x480 is 15 000; and the share of that where every marker is known to be flat.  A plain one
 with a marker takes about a thousand.
 
 A unit is what takes about a microsecond, counted and never measured, so that the same image always gets the same.

@@ -65,9 +65,9 @@ SIGMA_FLOOR_PX = 0.002
 """What a point's standard deviation never falls below: print, lens model, shape of the blur."""
 SQUARELY, MOST_SLANTED, SLANTING = 1.3, 6.0, 2.2
 """Prints that look more than so many times smaller one way than the other are off by more than noise moves them: their
-variance grows by this power of how many times more, up to a limit.  A blur is not as round there as it is taken for, nor
-a print as straight within it.  Measured on 40 pictures each of markers of 20 to 48 px, and turned by 70 to 80 degrees.
-"""
+variance grows by this power of how many times more, up to a limit.  A blur is not as round there as it is taken for,
+nor a print as straight within it.  Measured on 40 pictures each of markers of 20 to 48 px, and turned by 70 to 80
+degrees."""
 LEAST_BLUR_PX, MOST_BLUR_PX = 0.5, 8.0
 STEPS, SETTLED_PX = 6, 0.02
 TINY = 1e-9

@@ -195,8 +195,9 @@ class SimCamera:
         rows, columns = behind.shape
         map_x, map_y = (_upsampled(at.astype(np.float32), cells)[:rows, :columns] for at in (at_x, at_y))
         read = cv2.remap(picture, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        inside = (map_x > -0.5) & (map_x < texels - 0.5) & (map_y > -0.5) & (map_y < texels - 0.5)
-        return np.where(inside, read * np.float32(self._light.brightness / 255), behind)
+        inside = cv2.bitwise_and(*(cv2.inRange(at, -0.5, texels - 0.5) for at in (map_x, map_y)))
+        seen = cv2.multiply(read, self._light.brightness / 255, dtype=cv2.CV_32F)
+        return cv2.copyTo(seen, inside, dst=behind.copy())
 
     def _expose(self, light: Image, t_ns: int) -> NDArray[np.uint8]:
         sensor, camera = self._sensor, self._camera
