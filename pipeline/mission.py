@@ -193,7 +193,7 @@ class FilterSection(Section):
     angular_acceleration_rad_s2: float = Field(default=0.01, gt=0)
     correlation_s: float = Field(default=8.0, gt=0)
     """How long both last: braking, swaying and tumbling do for a good part of their period."""
-    edge_bias_px: float = Field(default=0.005, ge=0)
+    edge_bias_px: float = Field(default=0.006, ge=0)
     """How far the edges of a black square may be measured outside or inside their place, all four by the same."""
     edge_bias_shared: float = Field(default=0.5, ge=0, lt=1)
     """Of that variance, what is the same for all black squares: blur and exposure are of the whole picture."""
@@ -203,12 +203,12 @@ class FilterSection(Section):
     edge_turn_px: float = Field(default=0.002, ge=0)
     """How far the end of each edge may be outside for long, and its beginning inside."""
     one_edge_bias_correlation_s: float = Field(default=2.0, gt=0)
-    lasting_sigma_px: float = Field(default=0.008, ge=0)
+    lasting_sigma_px: float = Field(default=0.006, ge=0)
     """How much of the sigma that a detector gives is of such errors, and not new in each picture."""
     edge_end_correlation: float = Field(default=-0.5, gt=-1, lt=1)
     """Of what a line fitted along an edge is off at its two ends, where corners are; 0: corners are not where lines
     meet, and each of their coordinates is off by itself."""
-    corner_floor_px: float = Field(default=0.003, gt=0)
+    corner_floor_px: float = Field(default=0.004, gt=0)
     """No corner is believed better than this."""
     scale_sigma: float = Field(default=2e-4, ge=0)
     """How far the focal length, as a share of itself, may be off, or the marker's size: constant, considered."""
