@@ -1,7 +1,7 @@
 """A fast simulated camera: markers on panels before a dark sky, in grey, through a calibrated lens, by remapping.
 
 Where ``pipeline.scene`` casts rays at bodies, this reads each panel's picture through an image pyramid: ten to thirty
-times as fast, for closed loops and cameras at 20 Hz.  Edges stand where ``Camera.project`` puts them: pyramid and
+times as fast, for closed loops and cameras at 15 Hz.  Edges stand where ``Camera.project`` puts them: pyramid and
 interpolation blur them alike to both sides.  Pixels: (0, 0) is the centre of the top-left pixel.
 """
 
