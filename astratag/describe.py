@@ -53,8 +53,8 @@ POLISHED_TO_PX = 0.08
 POLISHED_PX, LEAST_POLISHED = 56.0, 0.95
 """Markers that look smaller are measured by all their pixels, not by their edges, where these look right.
 
-At 48 pixels poses are twice as exact so, at 60 by a half; it takes as long again as finding them, and from 80 pixels on
-so many points of the print would have to be looked at that edges are better.
+At 60 pixels poses are still more exact so by a half, but it takes half as long again as finding them; and from 80 on so
+many points of the print would have to be looked at that edges are better.
 """
 CELLS_WITHIN = np.array([layer_points(square(BORDER_UNITS, TEMPLATE_UNITS - BORDER_UNITS), layer) for layer in LAYERS])
 CELLS_WITHIN.flags.writeable = False

@@ -21,6 +21,7 @@ CAMERA = Camera([[1000, 0, 639.5], [0, 1000, 359.5], [0, 0, 1]], width=1280, hei
 CYLINDER = Cylinder(0.15)
 FACING = np.diag([1.0, -1.0, -1.0])
 TEXTURE = texture("AstraTag", 19, "equal")
+TURNED = next(one for one in CONDITIONS if one.name == "turn").scene(75)
 
 
 def photograph(
@@ -194,6 +195,14 @@ def test_the_edge_of_a_covering_is_not_taken_for_the_markers(surface: Surface | 
     assert [layer.layer for layer in seen.layers] == [2]
     assert np.abs(seen.corners_px - warp(square(0.0, 700.0))).max() < 0.5
     assert np.abs(seen.layers[0].corners_px - warp(square(*LAYERS[2].black))).max() < 4 * seen.layers[0].sigma_px
+
+
+@pytest.mark.parametrize("seed", [9236068, 9236075, 9236120])
+def test_a_print_turned_far_round_a_cylinder_is_found_by_its_near_side(seed: int) -> None:
+    """By 75 degrees: its far side is hidden, and the nearest of coarse turns is not near enough to read it."""
+    drawn = draw(TURNED, seed)
+    seen = one(Detector(side_m=SIDE_M).detect(drawn.photograph(TEXTURE), drawn.camera))
+    assert seen.marker_id == 19
 
 
 @pytest.mark.parametrize("blur_px", [3.5, 4.5])
