@@ -12,7 +12,7 @@ from astratag.signature import BLUR_UNITS, BLURRED_CELLS, EFFECTIVE_SHARE
 from astratag.transforms import exp_so3, pose
 from benchmarks.detection import clutter
 from benchmarks.detection.cost import SCENES, measure_cost
-from benchmarks.detection.covariance import Consistency, band, measure_covariance
+from benchmarks.detection.covariance import Consistency, band, information_of, marker_in, measure_covariance
 from benchmarks.detection.false_accepts import measure_effective_cells, measure_false_accepts
 from benchmarks.detection.figures import draw_condition, draw_cost, draw_covariance
 from benchmarks.detection.peers import ENTRANTS, MARKERS, TRACKED, Entrant, texture
@@ -133,3 +133,16 @@ def test_a_short_flight_of_the_filter_benchmark_is_at_its_bound(tmp_path):
     assert "NEES" in consistency(case, samples, 2)
     plot([(case, samples)], tmp_path / "filter.png")
     assert (tmp_path / "filter.png").stat().st_size > 0
+
+
+def test_the_bound_is_of_how_the_picture_of_a_moving_print_changes():
+    """Square-on, a print that moves sideways shifts: its slopes are the picture's own, found by another way."""
+    one, print_ = draw(Scene(side_px=120, tilt_deg=(0, 0)), 5), texture("AstraTag", 7, "equal")
+    picture = one.expected(print_, 16)
+    pixels_a_metre = one.camera.K[0, 0] / one.T_cam_print[2, 3]
+    waves = [2j * np.pi * np.fft.fftfreq(n) for n in picture.shape]
+    spectrum = np.fft.fft2(picture)
+    down, right = (np.fft.ifft2(spectrum * wave).real for wave in (waves[0][:, None], waves[1]))
+    x, y, _ = one.T_cam_print[:3, 0]
+    slopes = pixels_a_metre * (x * right + y * down)[marker_in(one)]
+    assert information_of(one, print_)[0, 0] == pytest.approx(slopes @ slopes / one.scene.noise_sigma**2, rel=0.05)

@@ -112,7 +112,7 @@ def band(poses: int) -> tuple[float, float]:
 def information_of(one: Draw, print_: Texture) -> Array:
     """Return what the pixels of a picture tell of the print's pose (6, 6): metres and radians, right perturbation."""
     sheet = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5]), axis=-1) * SHEET_M
-    marker, slopes = _marker_in(one), []
+    marker, slopes = marker_in(one), []
     for axis in np.eye(DEGREES_OF_FREEDOM):
         tiny = replace(one, T_cam_print=perturb(one.T_cam_print, LITTLE * axis))
         step = STEP_PX * LITTLE / np.abs(tiny.pixels(sheet) - one.pixels(sheet)).max()
@@ -124,7 +124,7 @@ def information_of(one: Draw, print_: Texture) -> Array:
     return np.array(slopes) @ np.array(slopes).T / one.scene.noise_sigma**2
 
 
-def _marker_in(one: Draw) -> NDArray[np.bool_]:
+def marker_in(one: Draw) -> NDArray[np.bool_]:
     """Return which pixels (height, width) show the print up to the middle of its quiet margin."""
     along = np.linspace(-1, 1, OUTLINE)
     sides = [(along, along * 0 + 1), (along * 0 + 1, -along), (-along, along * 0 - 1), (along * 0 - 1, along)]
