@@ -24,7 +24,7 @@ SMOOTHING_PX = 0.7
 """Standard deviation of the derivative filter, at least: little, so that neighbouring edges do not pull."""
 WITHIN_REACH = 0.6
 """An edge is looked for this fraction of the way to its nearest neighbour."""
-ROW_PX, MOST_ROWS, ROWS_REACH_PX, CLOSE_PX = 1.6, 5, 4.0, 2.0
+ROW_PX, MOST_ROWS, CLOSE_PX, ROWS_REACH_PX = 1.6, 5, 2.0, 4.0
 """Points of an edge far apart are looked at in several rows side by side, so far from each other that their noise is
 their own: where they are looked for so near, and neighbours are so far away."""
 LEAST_LENS_PX = 0.4
